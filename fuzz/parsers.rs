@@ -82,13 +82,13 @@ fn file(extension: &str, bytes: &[u8], read: impl FnOnce(&Path) -> Result<()>) {
 }
 
 /// Puts the bytes in the place of one file of a dataset and loads that.
-fn dataset(set: &str, place: &str, bytes: &[u8]) {
+fn dataset(set: &str, file: &str, bytes: &[u8]) {
     let root = FOLDER.with(|folder| folder.path().join(set));
     if !root.exists() {
         copy(&fixtures().join(set), &root);
     }
-    let original = fs::read(root.join(place)).unwrap_or_default();
-    fs::write(root.join(place), bytes).unwrap();
+    let original = fs::read(root.join(file)).unwrap_or_default();
+    fs::write(root.join(file), bytes).unwrap();
     printed(Dataset::load(&root, &LoadOptions::default()).map(|dataset| {
         assert!(dataset.points.iter().all(|point| point.position.is_finite()));
         let cameras = dataset.views.iter().map(|view| view.camera);
@@ -96,7 +96,7 @@ fn dataset(set: &str, place: &str, bytes: &[u8]) {
             assert!(camera.focal.is_finite() && camera.view_from_world.is_finite());
         }
     }));
-    fs::write(root.join(place), original).unwrap();
+    fs::write(root.join(file), original).unwrap();
 }
 
 /// An error is one line.

@@ -27,7 +27,7 @@ mod task;
 mod visibility;
 
 pub(crate) use join::join;
-pub(crate) use plan::{BlockPlan, MAX_ROUNDS, Request, Row};
+pub(crate) use plan::{BlockPlan, MAX_ROUNDS, PlanRow, Request};
 pub(crate) use planning::plan;
 pub(crate) use speed::speed;
 pub(crate) use task::{Task, load as load_tasks};

@@ -11,7 +11,7 @@ use crate::kernels::ceiling;
 
 /// What is measured.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Operation {
+pub(crate) enum CeilingOperation {
     /// Reads and writes; counted in bytes.
     Copy,
     /// Multiplies and adds; each counts.
@@ -20,7 +20,8 @@ pub(crate) enum Operation {
     Exchange,
 }
 
-const OPERATIONS: [Operation; 3] = [Operation::Copy, Operation::MultiplyAdd, Operation::Exchange];
+const OPERATIONS: [CeilingOperation; 3] =
+    [CeilingOperation::Copy, CeilingOperation::MultiplyAdd, CeilingOperation::Exchange];
 const OPERATIONS_PER_TURN: u32 = 16;
 /// Components of a vector.
 const COMPONENTS: usize = 4;
@@ -65,9 +66,9 @@ impl Ceiling {
         })
     }
 
-    fn record(&mut self, pass: &mut Recorder<'_>, operation: Operation) -> Result<()> {
+    fn record(&mut self, pass: &mut Recorder<'_>, operation: CeilingOperation) -> Result<()> {
         let (vectors, turns) = match operation {
-            Operation::Copy => (self.vectors[0], 0),
+            CeilingOperation::Copy => (self.vectors[0], 0),
             _ => (self.vectors[1], self.turns),
         };
         let (vector_count, values) = (vectors as u32, 0..COMPONENTS * vectors);
@@ -102,26 +103,26 @@ impl Ceiling {
         let begin = Instant::now();
         while begin.elapsed() < time {
             gpu.run("warm-up", |pass| {
-                (0..16).try_for_each(|_| self.record(pass, Operation::MultiplyAdd))
+                (0..16).try_for_each(|_| self.record(pass, CeilingOperation::MultiplyAdd))
             })?;
         }
         Ok(())
     }
 
     /// The seconds of one run.
-    pub(crate) fn seconds(&mut self, gpu: &Gpu, operation: Operation) -> Result<f64> {
+    pub(crate) fn seconds(&mut self, gpu: &Gpu, operation: CeilingOperation) -> Result<f64> {
         let times = gpu.profile("ceilings", |pass| self.record(pass, operation))?;
         Ok(times.iter().map(|time| time.milliseconds).sum::<f64>() * 1e-3)
     }
 
     /// How many bytes, operations or exchanges a run is.
-    pub(crate) fn amount(&self, operation: Operation) -> f64 {
+    pub(crate) fn amount(&self, operation: CeilingOperation) -> f64 {
         let [moved, computed] = self.vectors.map(|vectors| (vectors * COMPONENTS) as f64);
         let repeated = computed * f64::from(self.turns * OPERATIONS_PER_TURN);
         match operation {
-            Operation::Copy => 2.0 * moved * size_of::<f32>() as f64,
-            Operation::MultiplyAdd => 2.0 * repeated,
-            Operation::Exchange => repeated,
+            CeilingOperation::Copy => 2.0 * moved * size_of::<f32>() as f64,
+            CeilingOperation::MultiplyAdd => 2.0 * repeated,
+            CeilingOperation::Exchange => repeated,
         }
     }
 }

@@ -193,7 +193,7 @@ pub fn in_one_line(message: &str) -> String {
 
 /// Image formats for output.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
-pub enum ImageFormat {
+pub enum OutputFormat {
     /// 8 bits per channel, sRGB
     #[default]
     Png,
@@ -203,7 +203,7 @@ pub enum ImageFormat {
     Exr,
 }
 
-impl ImageFormat {
+impl OutputFormat {
     /// File extension.
     pub fn extension(self) -> &'static str {
         match self {

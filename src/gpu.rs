@@ -93,7 +93,7 @@ use crate::{Error, Result};
 /// A Vulkan device with one compute queue. Cloning shares the device.
 #[derive(Clone, Debug)]
 pub struct Gpu {
-    shared: Arc<Shared>,
+    shared: Arc<GpuShared>,
 }
 
 /// The identity of a device and its limits.
@@ -137,7 +137,7 @@ pub struct Properties {
 }
 
 /// Everything that buffers, pipelines and submissions need to outlive their [`Gpu`].
-struct Shared {
+struct GpuShared {
     properties: Properties,
     device: ash::Device,
     descriptors: descriptors::Descriptors,
@@ -156,7 +156,7 @@ struct Shared {
     queue: Mutex<Queue>,
     /// The family of the queue.
     family: u32,
-    progress: Mutex<Progress>,
+    progress: Mutex<SubmissionProgress>,
     timeline: vk::Semaphore,
     /// The timeline value of our last submission that may use a resource that is dropped now.
     last_submission: AtomicU64,
@@ -193,7 +193,7 @@ struct Queue {
 
 /// Progress of recording and submission. Unlike the queue, it is locked only briefly.
 #[derive(Default)]
-struct Progress {
+struct SubmissionProgress {
     /// The thread that records, and under which label.
     recording: Option<(ThreadId, String)>,
     /// The timeline value of the last submission.
@@ -202,7 +202,7 @@ struct Progress {
     labels: BTreeMap<u64, String>,
 }
 
-impl Progress {
+impl SubmissionProgress {
     /// The label under which this thread records.
     fn recorded_here(&self) -> Option<&str> {
         let here = thread::current().id();
@@ -226,7 +226,7 @@ enum Retired {
     Queries(vk::QueryPool),
 }
 
-impl std::fmt::Debug for Shared {
+impl std::fmt::Debug for GpuShared {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Shared").field("properties", &self.properties).finish_non_exhaustive()
     }
@@ -244,7 +244,7 @@ impl Gpu {
     }
 }
 
-impl Shared {
+impl GpuShared {
     /// An error for a Vulkan call that failed.
     fn error(&self, call: &'static str, result: vk::Result) -> Error {
         let device = self.properties.name.clone();
@@ -361,7 +361,7 @@ impl Shared {
     }
 }
 
-impl Drop for Shared {
+impl Drop for GpuShared {
     fn drop(&mut self) {
         let submitted = lock(&self.progress).submitted;
         // A lost device must still be destroyed.

@@ -23,7 +23,7 @@ fn main() -> ExitCode {
         .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
         .without_time();
-    let is_line = filter_fn(move |own| own.is_event() && *own.level() <= level);
+    let is_line = filter_fn(move |metadata| metadata.is_event() && *metadata.level() <= level);
     let phases = (cli.verbosity() > 0).then(|| Phases::begin().with_filter(Phases::filter()));
     tracing_subscriber::registry()
         .with(lines.with_filter(is_line.with_max_level_hint(level)))

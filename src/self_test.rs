@@ -50,7 +50,7 @@ pub(crate) fn functions(numbers: &[f32]) -> Vec<(f64, f64)> {
 }
 
 /// What the kernel left.
-struct Found {
+struct SelfTestResult {
     differing: Vec<u32>,
     arrivals: Vec<u32>,
     values: Vec<f32>,
@@ -122,7 +122,7 @@ impl Gpu {
         Ok(())
     }
 
-    fn run_self_test(&self) -> Result<Found> {
+    fn run_self_test(&self) -> Result<SelfTestResult> {
         #[cfg(feature = "testing")]
         let planted = crate::gpu::testing::faults(self).planted_check().unwrap_or(CHECKS);
         #[cfg(not(feature = "testing"))]
@@ -152,7 +152,7 @@ impl Gpu {
             let (differing, arrivals) = (pass.download(&differing)?, pass.download(&arrivals)?);
             Ok((differing, arrivals, pass.download(&values)?, pass.download(&words)?))
         })?;
-        Ok(Found {
+        Ok(SelfTestResult {
             differing: differing.wait()?,
             arrivals: arrivals.wait()?,
             values: values.wait()?,
@@ -161,7 +161,7 @@ impl Gpu {
     }
 }
 
-impl Found {
+impl SelfTestResult {
     /// The problem that a check found and its remedy, where it found one.
     fn problem(&self, check: u32, lanes: u32) -> Option<(String, String)> {
         let [count, value] = [0, 1].map(|word| self.differing[2 * check as usize + word]);

@@ -48,7 +48,7 @@ use crate::photographs::dataset::{Dataset, Fingerprint};
 use crate::photographs::tone::SceneLaw;
 use crate::splats::optimizer::{Adam, AdamStep, FiniteCheck, GaussianStep, LearningRates};
 use crate::splats::render::{Damping, Gradients, RenderOptions, Renderer};
-use crate::splats::scene::{ATTRIBUTES, Facts, Gaussians};
+use crate::splats::scene::{ATTRIBUTES, Gaussians, ModelFacts};
 use crate::splats::smoothing::SmoothingFloor;
 use crate::{Error, Result, splats};
 
@@ -66,7 +66,7 @@ use growth::Growth;
 use lamp::LampLearning;
 pub use layers::{Origin, Settings, SettingsLayer, values};
 pub use memory::MemoryEstimate;
-use model::Model;
+use model::TrainedModel;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 use passes::background;
@@ -115,7 +115,7 @@ pub struct StepReport {
 impl StepReport {
     /// The value of a term; 0 if the model does not have it.
     pub fn term(&self, term: Term) -> f64 {
-        self.terms.iter().find(|(own, _)| *own == term).map_or(0.0, |&(_, value)| value)
+        self.terms.iter().find(|(name, _)| *name == term).map_or(0.0, |&(_, value)| value)
     }
 }
 
@@ -151,7 +151,7 @@ pub struct Trainer {
     /// Steps done.
     step: u64,
     supervision: Supervision,
-    model: Model,
+    model: TrainedModel,
     renderer: Renderer,
     optimizer: Optimizer,
     growth: Growth,
@@ -180,7 +180,7 @@ impl Trainer {
     /// # Errors
     /// The configuration is invalid, the initial model does not fit it, or the device is out of memory or lost.
     pub fn new(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
-        let initial = Initial::of(&config, dataset)?;
+        let initial = Initial::load(&config, dataset)?;
         Self::on_patches(gpu, config, dataset, &initial)
     }
 
@@ -226,8 +226,8 @@ impl Trainer {
 
     /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world.
     pub(crate) fn model_of(&self, in_frame: &Gaussians) -> splats::model::Model {
-        let facts = Facts { law: self.law, ..self.config.facts(&self.frame) };
-        splats::model::Model::of(in_frame.to_world(&self.frame), &facts)
+        let facts = ModelFacts { law: self.law, ..self.config.facts(&self.frame) };
+        splats::model::Model::new(in_frame.to_world(&self.frame), &facts)
     }
 
     /// The Gaussians in [`Trainer::frame`], bit for bit as trained.

@@ -63,10 +63,10 @@ void main() {
     uint workgroup = WORKGROUP_INDEX;
     if (workgroup >= WORKGROUPS) return;
     uint lane = gl_LocalInvocationID.x;
-    uint own = number_of(lane);
-    uvec4 ballot = subgroupBallot((own & 1) != 0);
-    uint shuffled = subgroupShuffle(own, lane ^ 1);
-    uint inclusive = subgroupInclusiveAdd(own);
+    uint number = number_of(lane);
+    uvec4 ballot = subgroupBallot((number & 1) != 0);
+    uint shuffled = subgroupShuffle(number, lane ^ 1);
+    uint inclusive = subgroupInclusiveAdd(number);
     if (workgroup < 16) {
         compare(CHECK_SIZE, gl_SubgroupSize, SUBGROUP_SIZE);
         compare(CHECK_LANE, gl_SubgroupInvocationID, lane);

@@ -26,11 +26,11 @@ ConicGradient conic_backward(vec3 conic, vec3 u0, vec3 u1, vec3 d_conic) {
 ConicGradient compensation_backward(vec3 u0, vec3 u1) {
     float xx = dot(u0, u0), xy = dot(u0, u1), yy = dot(u1, u1);
     vec3 normal = cross(u0, u1);
-    float own = dot(normal, normal);
-    float det = own + DILATION * (xx + yy) + DILATION * DILATION;
-    float shared_term = DILATION * (xy / own) * ((xx + yy + DILATION) / det);
-    float own0 = DILATION * ((yy / own) * ((yy + DILATION) / det) + (xy / own) * (xy / det));
-    float own1 = DILATION * ((xx / own) * ((xx + DILATION) / det) + (xy / own) * (xy / det));
+    float area_squared = dot(normal, normal);
+    float det = area_squared + DILATION * (xx + yy) + DILATION * DILATION;
+    float shared_term = DILATION * (xy / area_squared) * ((xx + yy + DILATION) / det);
+    float own0 = DILATION * ((yy / area_squared) * ((yy + DILATION) / det) + (xy / area_squared) * (xy / det));
+    float own1 = DILATION * ((xx / area_squared) * ((xx + DILATION) / det) + (xy / area_squared) * (xy / det));
     vec3 d_u0 = own0 * u0 - shared_term * u1;
     vec3 d_u1 = own1 * u1 - shared_term * u0;
     return ConicGradient(d_u0, d_u1, u0 * d_u0 + u1 * d_u1);

@@ -32,7 +32,7 @@ void sync() {
 
 // Adds the keys from `first` on, of this lane, to the counters of the subgroup.
 void count_keys(uint first, uint end, uint shift, uint digit_bits) {
-    uint own = gl_LocalInvocationID.y * MAX_DIGITS;
+    uint row_begin = gl_LocalInvocationID.y * MAX_DIGITS;
     if (!is_shared()) {
         for (uint i = first; i < end; i += SUBGROUP_SIZE) {
             atomicAdd(keys_with_digit[digit_of(keys[i], shift, digit_bits)], 1);
@@ -44,7 +44,7 @@ void count_keys(uint first, uint end, uint shift, uint digit_bits) {
         [[unroll]] for (uint k = 0; k < KEYS_AHEAD; k++) key[k] = keys[min(first + k * SUBGROUP_SIZE, end - 1)];
         [[unroll]] for (uint k = 0; k < KEYS_AHEAD; k++) {
             if (first + k * SUBGROUP_SIZE < end) {
-                atomicAdd(keys_with_digit[own + digit_of(key[k], shift, digit_bits)], 1);
+                atomicAdd(keys_with_digit[row_begin + digit_of(key[k], shift, digit_bits)], 1);
             }
         }
     }

@@ -18,7 +18,7 @@ struct Lamp {
 struct LampPoint {
     vec3  axis;
     vec3  towards;   // r / d
-    float own;       // |r|
+    float radius;       // |r|
     float distance;  // within its bounds
     float away;      // u
     float beam;      // the lamp's light over that on the axis at the reference distance
@@ -29,90 +29,90 @@ float softplus(float x) { return max(x, 0.0) + log(1.0 + exp(-abs(x))); }
 
 // From the array `lamp`, which the kernel declares.
 Lamp load_lamp() {
-    Lamp own;
-    own.reference_distance = lamp[LAMP_REFERENCE_DISTANCE];
-    own.slope = lamp[LAMP_SLOPE];
-    own.black = lamp[LAMP_BLACK];
-    own.reach = lamp[LAMP_REACH];
-    own.position = LAMP_STEP * own.reference_distance * vec3(lamp[0], lamp[1], lamp[2]);
-    own.tangents = vec3(LAMP_STEP * lamp[3], LAMP_STEP * lamp[4], 1.0);
-    own.ambient = LAMP_LEAST_AMBIENT + (1.0 - LAMP_LEAST_AMBIENT) * sigmoid(lamp[LAMP_AMBIENT]);
-    own.exponent = LAMP_LARGEST_EXPONENT * sigmoid(lamp[LAMP_EXPONENT]);
-    own.falloffs = LAMP_FALLOFF_STEP * vec2(softplus(lamp[LAMP_FALLOFFS]), softplus(lamp[LAMP_FALLOFFS + 1]));
-    return own;
+    Lamp loaded;
+    loaded.reference_distance = lamp[LAMP_REFERENCE_DISTANCE];
+    loaded.slope = lamp[LAMP_SLOPE];
+    loaded.black = lamp[LAMP_BLACK];
+    loaded.reach = lamp[LAMP_REACH];
+    loaded.position = LAMP_STEP * loaded.reference_distance * vec3(lamp[0], lamp[1], lamp[2]);
+    loaded.tangents = vec3(LAMP_STEP * lamp[3], LAMP_STEP * lamp[4], 1.0);
+    loaded.ambient = LAMP_LEAST_AMBIENT + (1.0 - LAMP_LEAST_AMBIENT) * sigmoid(lamp[LAMP_AMBIENT]);
+    loaded.exponent = LAMP_LARGEST_EXPONENT * sigmoid(lamp[LAMP_EXPONENT]);
+    loaded.falloffs = LAMP_FALLOFF_STEP * vec2(softplus(lamp[LAMP_FALLOFFS]), softplus(lamp[LAMP_FALLOFFS + 1]));
+    return loaded;
 }
 
-LampPoint lamp_at(Lamp own, vec3 point) {
+LampPoint lamp_at(Lamp loaded, vec3 point) {
     LampPoint at;
-    vec3 offset = point - own.position;
-    at.own = length(offset);
-    at.distance = own.reference_distance * clamp(at.own / own.reference_distance, LAMP_NEAREST, LAMP_FARTHEST);
-    at.axis = own.tangents / length(own.tangents);
+    vec3 offset = point - loaded.position;
+    at.radius = length(offset);
+    at.distance = loaded.reference_distance * clamp(at.radius / loaded.reference_distance, LAMP_NEAREST, LAMP_FARTHEST);
+    at.axis = loaded.tangents / length(loaded.tangents);
     at.towards = offset / at.distance;
     at.away = 1.0 - clamp(dot(at.towards, at.axis), -1.0, 1.0);
-    float decay = own.exponent * log(at.distance / own.reference_distance);
-    at.beam = exp(-decay - (own.falloffs.x + own.falloffs.y * at.away) * at.away);
-    at.light = own.ambient + (1.0 - own.ambient) * at.beam;
+    float decay = loaded.exponent * log(at.distance / loaded.reference_distance);
+    at.beam = exp(-decay - (loaded.falloffs.x + loaded.falloffs.y * at.away) * at.away);
+    at.light = loaded.ambient + (1.0 - loaded.ambient) * at.beam;
     return at;
 }
 
-float lamp_factor(Lamp own, LampPoint at) { return exp(own.slope * log(at.light)); }
+float lamp_factor(Lamp loaded, LampPoint at) { return exp(loaded.slope * log(at.light)); }
 
-float lamp_tone(Lamp own, float x) {
-    float bent = x / own.reach;
-    if (own.reach == 0.0 || bent < 0.0) return x;
+float lamp_tone(Lamp loaded, float x) {
+    float bent = x / loaded.reach;
+    if (loaded.reach == 0.0 || bent < 0.0) return x;
     float line = 1.0 - LAMP_LEFT + LAMP_LEFT * (bent - LAMP_KNEE);
-    return own.reach * (bent < LAMP_KNEE ? 1.0 - exp(-bent) : line);
+    return loaded.reach * (bent < LAMP_KNEE ? 1.0 - exp(-bent) : line);
 }
 
-float lamp_tone_inverse(Lamp own, float above) {
-    float share = above / own.reach;
-    if (own.reach == 0.0 || share < 0.0) return above;
+float lamp_tone_inverse(Lamp loaded, float above) {
+    float share = above / loaded.reach;
+    if (loaded.reach == 0.0 || share < 0.0) return above;
     float line = LAMP_KNEE + (share - (1.0 - LAMP_LEFT)) / LAMP_LEFT;
-    return own.reach * (share < 1.0 - LAMP_LEFT ? -log(1.0 - share) : line);
+    return loaded.reach * (share < 1.0 - LAMP_LEFT ? -log(1.0 - share) : line);
 }
 
 // d tone / dx
-float lamp_tone_slope(Lamp own, float x) {
-    return own.reach == 0.0 || x < 0.0 ? 1.0 : exp(-min(x / own.reach, LAMP_KNEE));
+float lamp_tone_slope(Lamp loaded, float x) {
+    return loaded.reach == 0.0 || x < 0.0 ? 1.0 : exp(-min(x / loaded.reach, LAMP_KNEE));
 }
 
 // A colour in the light with this factor.
-vec3 lamp_lit(Lamp own, float factor, vec3 color) {
+vec3 lamp_lit(Lamp loaded, float factor, vec3 color) {
     for (uint c = 0; c < 3; c++)
-        color[c] = own.black + lamp_tone(own, factor * lamp_tone_inverse(own, color[c] - own.black));
+        color[c] = loaded.black + lamp_tone(loaded, factor * lamp_tone_inverse(loaded, color[c] - loaded.black));
     return color;
 }
 
 // d ln light / d ln beam
-float lamp_share(Lamp own, LampPoint at) { return (1.0 - own.ambient) * at.beam / at.light; }
+float lamp_share(Lamp loaded, LampPoint at) { return (1.0 - loaded.ambient) * at.beam / at.light; }
 
 // The steepness of the falloff: -d ln beam / du.
-float lamp_turn(Lamp own, LampPoint at) { return own.falloffs.x + 2.0 * own.falloffs.y * at.away; }
+float lamp_turn(Lamp loaded, LampPoint at) { return loaded.falloffs.x + 2.0 * loaded.falloffs.y * at.away; }
 
 // The gradient of ln factor with respect to the point.
-vec3 lamp_point_gradient(Lamp own, LampPoint at) {
-    if (at.own > LAMP_FARTHEST * own.reference_distance) return vec3(0.0);
-    float turn = lamp_turn(own, at);
+vec3 lamp_point_gradient(Lamp loaded, LampPoint at) {
+    if (at.radius > LAMP_FARTHEST * loaded.reference_distance) return vec3(0.0);
+    float turn = lamp_turn(loaded, at);
     vec3 gradient = turn * at.axis;
-    if (at.own >= LAMP_NEAREST * own.reference_distance)
-        gradient -= (own.exponent + turn * dot(at.towards, at.axis)) * at.towards;
-    return own.slope * lamp_share(own, at) / at.distance * gradient;
+    if (at.radius >= LAMP_NEAREST * loaded.reference_distance)
+        gradient -= (loaded.exponent + turn * dot(at.towards, at.axis)) * at.towards;
+    return loaded.slope * lamp_share(loaded, at) / at.distance * gradient;
 }
 
 // The gradient of ln factor with respect to the learned numbers.
-void lamp_gradient(Lamp own, LampPoint at, out float gradient[LAMP_WIDTH]) {
-    float share = own.slope * lamp_share(own, at), turn = share * lamp_turn(own, at);
-    vec3 d_position = -LAMP_STEP * own.reference_distance * lamp_point_gradient(own, at);
-    vec3 d_axis = at.own > LAMP_FARTHEST * own.reference_distance ? vec3(0.0) : turn * at.towards;
-    vec3 d_tangents = LAMP_STEP * (d_axis - at.axis * dot(at.axis, d_axis)) / length(own.tangents);
+void lamp_gradient(Lamp loaded, LampPoint at, out float gradient[LAMP_WIDTH]) {
+    float share = loaded.slope * lamp_share(loaded, at), turn = share * lamp_turn(loaded, at);
+    vec3 d_position = -LAMP_STEP * loaded.reference_distance * lamp_point_gradient(loaded, at);
+    vec3 d_axis = at.radius > LAMP_FARTHEST * loaded.reference_distance ? vec3(0.0) : turn * at.towards;
+    vec3 d_tangents = LAMP_STEP * (d_axis - at.axis * dot(at.axis, d_axis)) / length(loaded.tangents);
     [[unroll]] for (uint k = 0; k < 3; k++) gradient[k] = d_position[k];
     [[unroll]] for (uint k = 0; k < 2; k++) gradient[3 + k] = d_tangents[k];
     float raised = sigmoid(lamp[LAMP_AMBIENT]), bent = sigmoid(lamp[LAMP_EXPONENT]);
     gradient[LAMP_AMBIENT] =
-        own.slope * (1.0 - at.beam) / at.light * (1.0 - LAMP_LEAST_AMBIENT) * raised * (1.0 - raised);
+        loaded.slope * (1.0 - at.beam) / at.light * (1.0 - LAMP_LEAST_AMBIENT) * raised * (1.0 - raised);
     gradient[LAMP_EXPONENT] =
-        -share * log(at.distance / own.reference_distance) * LAMP_LARGEST_EXPONENT * bent * (1.0 - bent);
+        -share * log(at.distance / loaded.reference_distance) * LAMP_LARGEST_EXPONENT * bent * (1.0 - bent);
     gradient[LAMP_FALLOFFS] = -share * at.away * LAMP_FALLOFF_STEP * sigmoid(lamp[LAMP_FALLOFFS]);
     gradient[LAMP_FALLOFFS + 1] =
         -share * at.away * at.away * LAMP_FALLOFF_STEP * sigmoid(lamp[LAMP_FALLOFFS + 1]);

@@ -27,11 +27,11 @@ Strip strip_of(uint workgroup) {
 }
 
 // Whether a place of row `y` of the strip is in the image, and its index in the image.
-bool is_in_image(Strip strip, uint place, int y) {
-    return strip.x + place - RADIUS < width && uint(y) < height;
+bool is_in_image(Strip strip, uint column, int y) {
+    return strip.x + column - RADIUS < width && uint(y) < height;
 }
-uint index_of(Strip strip, uint place, int y) {
-    return (strip.channel * height + uint(y)) * width + strip.x + place - RADIUS;
+uint index_of(Strip strip, uint column, int y) {
+    return (strip.channel * height + uint(y)) * width + strip.x + column - RADIUS;
 }
 
 // Orders the subgroup's accesses to shared memory.

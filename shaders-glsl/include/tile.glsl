@@ -60,8 +60,8 @@ uint splat_groups(ProjectedSplat splat, uvec2 origin) {
             last += uint(max(columns.y, 0.0));
         }
         // Bits first..last; the shift past bit 31 wraps to zero as intended.
-        uint own = (2u << last / SUBGROUP_SIZE) - (1u << first / SUBGROUP_SIZE);
-        groups |= columns.x <= columns.y ? own : 0;
+        uint covered = (2u << last / SUBGROUP_SIZE) - (1u << first / SUBGROUP_SIZE);
+        groups |= columns.x <= columns.y ? covered : 0;
     }
     return SKIPS_GROUPS ? groups : ~0u;
 }

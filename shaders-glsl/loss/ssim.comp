@@ -118,8 +118,8 @@ void store_row(Strip strip, uint at, float gradient[COLUMNS]) {
     if (is_aligned()) {
         [[unroll]] for (uint x = 0; x < COLUMNS; x += 4)
             if (has_output(strip, x)) {
-                vec4 own = vec4(gradient[x], gradient[x + 1], gradient[x + 2], gradient[x + 3]);
-                d_render[(at + x) / 4] = ADDS ? d_render[(at + x) / 4] + own : own;
+                vec4 added = vec4(gradient[x], gradient[x + 1], gradient[x + 2], gradient[x + 3]);
+                d_render[(at + x) / 4] = ADDS ? d_render[(at + x) / 4] + added : added;
             }
     } else {
         [[unroll]] for (uint x = 0; x < COLUMNS; ++x)
@@ -131,10 +131,10 @@ void store_row(Strip strip, uint at, float gradient[COLUMNS]) {
 }
 
 // Column `k` of those within a lane's windows, the first of them RADIUS before its own.
-float seen(float own[COLUMNS], uint k) {
+float seen(float columns[COLUMNS], uint k) {
     int column = int(k) - RADIUS;
     int lanes = (column + 16 * int(COLUMNS)) / int(COLUMNS) - 16;
-    float value = own[column - lanes * int(COLUMNS)];
+    float value = columns[column - lanes * int(COLUMNS)];
     if (lanes == 0) return value;
     return subgroupShuffle(value, (gl_SubgroupInvocationID + uint(lanes)) & (SUBGROUP_SIZE - 1));
 }
@@ -181,21 +181,21 @@ void main() {
             row[PRODUCT][k] = a_here * b_here;
         }
         int complete = y - RADIUS;
-        float own[DERIVATIVES][COLUMNS];
+        float derivatives[DERIVATIVES][COLUMNS];
         [[unroll]] for (uint x = 0; x < COLUMNS; ++x) {
             float moments[MOMENTS];
             [[unroll]] for (uint m = 0; m < MOMENTS; ++m) moments[m] = march(pending[m][x], blur(row[m], x));
             bool counts = is_inside(uint(strip.x) + x, uint(complete));
             vec3 d_moments;
             float s = ssim(vec4(moments[A], moments[B], moments[SQUARES], moments[PRODUCT]), d_moments);
-            [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) own[m][x] = counts ? d_moments[m] : 0.0;
+            [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) derivatives[m][x] = counts ? d_moments[m] : 0.0;
             bool is_own = complete >= strip.y && complete < strip.end && has_output(strip, x);
             ssim_sum += counts && is_own ? s : 0.0;
         }
 
         float d_row[DERIVATIVES][REACH];
         [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m)
-            [[unroll]] for (uint k = 0; k < REACH; ++k) d_row[m][k] = seen(own[m], k);
+            [[unroll]] for (uint k = 0; k < REACH; ++k) d_row[m][k] = seen(derivatives[m], k);
         int done = y - 2 * RADIUS;
         load_row(strip, done, a, b);
         float gradient[COLUMNS];

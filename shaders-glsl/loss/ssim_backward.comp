@@ -53,14 +53,14 @@ shared vec3 shared_rows[2 * ROW];
 // Loads the derivatives of row `y`; zero outside the image.
 void load_row(Strip strip, int y, uint first) {
     [[unroll]] for (uint k = 0; k < LOADS; ++k) {
-        uint place = k * SUBGROUP_SIZE + gl_SubgroupInvocationID;
-        if (place >= ROW) continue;
-        vec3 own = vec3(0.0);
-        if (is_in_image(strip, place, y)) {
-            uint at = index_of(strip, place, y);
-            own = vec3(d_mean[at], d_square[at], d_product[at]);
+        uint column = k * SUBGROUP_SIZE + gl_SubgroupInvocationID;
+        if (column >= ROW) continue;
+        vec3 loaded = vec3(0.0);
+        if (is_in_image(strip, column, y)) {
+            uint at = index_of(strip, column, y);
+            loaded = vec3(d_mean[at], d_square[at], d_product[at]);
         }
-        shared_rows[first + place] = own;
+        shared_rows[first + column] = loaded;
     }
 }
 

@@ -35,14 +35,14 @@ shared vec2 shared_rows[2 * ROW];
 // Loads row `y` of both images; zero outside the image.
 void load_row(Strip strip, int y, uint first) {
     [[unroll]] for (uint k = 0; k < LOADS; ++k) {
-        uint place = k * SUBGROUP_SIZE + gl_SubgroupInvocationID;
-        if (place >= ROW) continue;
-        vec2 own = vec2(0.0);
-        if (is_in_image(strip, place, y)) {
-            uint at = index_of(strip, place, y);
-            own = vec2(render[at], target[at]);
+        uint column = k * SUBGROUP_SIZE + gl_SubgroupInvocationID;
+        if (column >= ROW) continue;
+        vec2 loaded = vec2(0.0);
+        if (is_in_image(strip, column, y)) {
+            uint at = index_of(strip, column, y);
+            loaded = vec2(render[at], target[at]);
         }
-        shared_rows[first + place] = own;
+        shared_rows[first + column] = loaded;
     }
 }
 

@@ -101,22 +101,22 @@ void main() {
             // Unrolled: around a loop that stays one, the index of a matrix is no constant and moves all to memory.
             [[unroll]] for (uint k = 0; k < M * N; k += SUBGROUP_SIZE) {
                 uint i = k + gl_SubgroupInvocationID;
-                uint own = first_out + b * M + i / N, other = first_in + i % N;
-                if (i < M * N && own < out_channels && other < in_channels)
-                    partials[set + (own * in_channels + other) * TAPS + t] = unpacked(sums[i], largest_d_target[0],
+                uint channel = first_out + b * M + i / N, other = first_in + i % N;
+                if (i < M * N && channel < out_channels && other < in_channels)
+                    partials[set + (channel * in_channels + other) * TAPS + t] = unpacked(sums[i], largest_d_target[0],
                         largest_source[0]);
             }
         }
     }
 
     if (first_in > 0) return;
-    for (uint own = first_out; own < min(first_out + BLOCKS * M, out_channels); ++own) {
+    for (uint channel = first_out; channel < min(first_out + BLOCKS * M, out_channels); ++channel) {
         float bias = 0.0;
-        uint begin = (own * size.y + top) * size.x;
+        uint begin = (channel * size.y + top) * size.x;
         for (uint i = gl_SubgroupInvocationID; i < (end - top) * size.x; i += SUBGROUP_SIZE)
             bias += d_target_single[begin + i];
         bias = subgroupAdd(bias);
-        if (gl_SubgroupInvocationID == 0) partials[set + weight_count + own] = bias;
+        if (gl_SubgroupInvocationID == 0) partials[set + weight_count + channel] = bias;
     }
 }
 #endif

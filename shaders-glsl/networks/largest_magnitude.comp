@@ -23,9 +23,9 @@ layout(binding = 1)          buffer Largest { uint largest[]; };  // one
 void main() {
     uint first = WORKGROUP_INDEX * CHUNK;
     uint end = min(first + CHUNK, value_count);
-    uint own = 0;
+    uint largest_seen = 0;
     for (uint i = first + gl_SubgroupInvocationID; i < end; i += SUBGROUP_SIZE)
-        own = max(own, floatBitsToUint(values[offset + i]) & 0x7fffffffu);
-    own = subgroupMax(own);
-    if (subgroupElect() && own > 0) atomicMax(largest[0], own);
+        largest_seen = max(largest_seen, floatBitsToUint(values[offset + i]) & 0x7fffffffu);
+    largest_seen = subgroupMax(largest_seen);
+    if (subgroupElect() && largest_seen > 0) atomicMax(largest[0], largest_seen);
 }

@@ -46,9 +46,9 @@ float stored(uint i) {
 vec3 automatic(vec3 t, float y, ToneParameters tone) {
     float least = max(y, 1e-20);
     float factor = one_minus_exp(least) / least;
-    vec3 own = vec3(one_minus_exp(t.r), one_minus_exp(t.g), one_minus_exp(t.b));
+    vec3 toe = vec3(one_minus_exp(t.r), one_minus_exp(t.g), one_minus_exp(t.b));
     float share = tone.constants[0];
-    return tone.offset + (1.0 - tone.offset) * ((1.0 - share) * own + share * (t * factor));
+    return tone.offset + (1.0 - tone.offset) * ((1.0 - share) * toe + share * (t * factor));
 }
 
 // Written so that a NaN becomes black.
@@ -105,12 +105,12 @@ float tabled(uint channel, float x) {
 // v = 1 - exp(-x / white); u = a v + b, clamped to [0, 1]; y = s_0 + sum of s_i clamp(16 u - i + 1, 0, 1) over 16 rises
 // s_i of equal width. The sum of ramps is continuous, so no rounding of u can jump.
 float profiled(uint channel, vec3 v) {
-    uint own = PROFILE_WIDTH * channel;
-    float u = numbers[own] * v.r + numbers[own + 1] * v.g + numbers[own + 2] * v.b + numbers[own + 3];
-    float place = float(SEGMENTS) * clamp(u, 0.0, 1.0);
-    float y = numbers[own + 4];
+    uint begin = PROFILE_WIDTH * channel;
+    float u = numbers[begin] * v.r + numbers[begin + 1] * v.g + numbers[begin + 2] * v.b + numbers[begin + 3];
+    float scaled = float(SEGMENTS) * clamp(u, 0.0, 1.0);
+    float y = numbers[begin + 4];
     for (uint segment = 0; segment < SEGMENTS; ++segment) {
-        y += numbers[own + 5 + segment] * clamp(place - float(segment), 0.0, 1.0);
+        y += numbers[begin + 5 + segment] * clamp(scaled - float(segment), 0.0, 1.0);
     }
     return clamp(y, 0.0, 1.0);
 }

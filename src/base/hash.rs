@@ -41,7 +41,7 @@ impl Hasher {
 }
 
 /// The checksum of some bytes.
-pub fn of(bytes: &[u8]) -> u64 {
+pub fn checksum(bytes: &[u8]) -> u64 {
     let mut hasher = Hasher::default();
     hasher.write(bytes);
     hasher.finish()
@@ -71,27 +71,27 @@ mod tests {
     #[test]
     fn every_bit_length_and_boundary_matters() {
         let bytes: Vec<u8> = (0..67_u32).map(|i| (i * i % 251) as u8).collect();
-        let mut seen = std::collections::BTreeSet::from([of(&bytes)]);
+        let mut seen = std::collections::BTreeSet::from([checksum(&bytes)]);
         for bit in 0..8 * bytes.len() {
             let mut flipped = bytes.clone();
             flipped[bit / 8] ^= 1 << (bit % 8);
-            assert!(seen.insert(of(&flipped)), "bit {bit}");
+            assert!(seen.insert(checksum(&flipped)), "bit {bit}");
         }
         for length in 0..bytes.len() {
-            assert!(seen.insert(of(&bytes[..length])), "length {length}");
+            assert!(seen.insert(checksum(&bytes[..length])), "length {length}");
             let mut parted = Hasher::default();
             parted.write(&bytes[..length]);
             parted.write(&bytes[length..]);
             assert!(seen.insert(parted.finish()), "parted at {length}");
         }
         for zeros in 2..40 {
-            assert!(seen.insert(of(&vec![0; zeros])), "{zeros} zeros");
+            assert!(seen.insert(checksum(&vec![0; zeros])), "{zeros} zeros");
         }
     }
 
     #[test]
     fn a_checksum_is_the_same_on_every_machine() {
-        assert_eq!(text(of(b"nightsplat")), "02603cd5976257bc");
-        assert_eq!(text(of(b"")), "f2b4f503f53f54e1");
+        assert_eq!(text(checksum(b"nightsplat")), "02603cd5976257bc");
+        assert_eq!(text(checksum(b"")), "f2b4f503f53f54e1");
     }
 }

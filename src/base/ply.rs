@@ -2,7 +2,7 @@
 
 /// How vertices are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Encoding {
+pub enum PlyEncoding {
     /// A line each.
     Text,
     /// Binary, the least significant byte first.
@@ -11,7 +11,7 @@ pub enum Encoding {
     Big,
 }
 
-impl Encoding {
+impl PlyEncoding {
     /// Its name in a header.
     pub fn name(self) -> &'static str {
         match self {
@@ -24,7 +24,7 @@ impl Encoding {
 
 /// The type of a number, with its bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum PlyScalar {
     /// Of whole numbers.
     Signed(usize),
     /// Of whole numbers from 0 on.
@@ -33,8 +33,8 @@ pub enum Kind {
     Float(usize),
 }
 
-impl Kind {
-    fn of(name: &str) -> Option<Self> {
+impl PlyScalar {
+    fn from_name(name: &str) -> Option<Self> {
         Some(match name {
             "char" | "int8" => Self::Signed(1),
             "short" | "int16" => Self::Signed(2),
@@ -58,37 +58,37 @@ impl Kind {
 
 /// A number of every vertex.
 #[derive(Clone, Debug)]
-pub struct Property {
+pub struct PlyProperty {
     /// Its name.
     pub name: String,
     /// The name of its type.
     pub type_name: String,
     /// Its type.
-    pub kind: Kind,
+    pub kind: PlyScalar,
     /// Bytes of a vertex before it.
     pub at: usize,
 }
 
 /// What a header says of the vertices.
 #[derive(Clone, Debug)]
-pub struct Header {
+pub struct PlyHeader {
     /// Bytes before the first vertex.
     pub length: usize,
     /// How they are written.
-    pub encoding: Encoding,
+    pub encoding: PlyEncoding,
     /// Vertices.
     pub count: usize,
     /// Bytes per vertex, of a binary file.
     pub stride: usize,
     /// Their numbers, in order.
-    pub properties: Vec<Property>,
+    pub properties: Vec<PlyProperty>,
     /// Whether other elements follow the vertices.
     pub has_more: bool,
     /// Its comments, each with the number of its line.
     pub comments: Vec<(usize, String)>,
 }
 
-impl Header {
+impl PlyHeader {
     /// Reads the header at the beginning of a file.
     pub fn parse(bytes: &[u8]) -> Result<Self, String> {
         const END: &[u8] = b"end_header";
@@ -100,7 +100,7 @@ impl Header {
         let newline = bytes[end..].iter().position(|&byte| byte == b'\n').ok_or(cut_short)?;
         let mut header = Self {
             length: end + newline + 1,
-            encoding: Encoding::Text,
+            encoding: PlyEncoding::Text,
             count: 0,
             stride: 0,
             properties: vec![],
@@ -115,7 +115,7 @@ impl Header {
             }
             match *line.split_whitespace().collect::<Vec<_>>() {
                 ["format", name, ..] => {
-                    let all = [Encoding::Text, Encoding::Little, Encoding::Big];
+                    let all = [PlyEncoding::Text, PlyEncoding::Little, PlyEncoding::Big];
                     let found = all.into_iter().find(|encoding| encoding.name() == name);
                     encoding = Some(found.ok_or_else(|| format!("has the unknown format {name}"))?);
                 }
@@ -147,19 +147,19 @@ impl Header {
     }
 
     fn push(&mut self, type_name: &str, name: &str) -> Result<(), String> {
-        let kind = Kind::of(type_name)
+        let kind = PlyScalar::from_name(type_name)
             .ok_or_else(|| format!("property `{name}` has the unknown type `{type_name}`"))?;
         if self.property(name).is_some() {
             return Err(format!("property `{name}` is there twice"));
         }
         let (name, type_name) = (name.to_owned(), type_name.to_owned());
-        self.properties.push(Property { name, type_name, kind, at: self.stride });
+        self.properties.push(PlyProperty { name, type_name, kind, at: self.stride });
         self.stride += kind.size();
         Ok(())
     }
 
     /// A number of every vertex, with its place among them.
-    pub fn property(&self, name: &str) -> Option<(usize, &Property)> {
+    pub fn property(&self, name: &str) -> Option<(usize, &PlyProperty)> {
         self.properties.iter().enumerate().find(|(_, property)| property.name == name)
     }
 }

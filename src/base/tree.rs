@@ -17,8 +17,8 @@ const MOST_OF_ENTRY: u64 = 1 << 31;
 const MOST_OF_ALL: u64 = 1 << 37;
 
 /// An open file, on disk or in memory.
-pub(crate) trait Source: Read + Seek + Send {}
-impl<T: Read + Seek + Send> Source for T {}
+pub(crate) trait ReadSeek: Read + Seek + Send {}
+impl<T: Read + Seek + Send> ReadSeek for T {}
 
 /// Whether a path is a file.
 pub(crate) fn is_file(path: &Path) -> bool {
@@ -59,7 +59,7 @@ pub(crate) fn metadata(path: &Path) -> io::Result<(u64, Option<SystemTime>)> {
 }
 
 /// Opens a file.
-pub(crate) fn open(path: &Path) -> io::Result<Box<dyn Source>> {
+pub(crate) fn open(path: &Path) -> io::Result<Box<dyn ReadSeek>> {
     match archived(path) {
         Some((archive, entry)) => Ok(Box::new(Cursor::new(archive.read(&entry)?))),
         None => Ok(Box::new(File::open(path)?)),

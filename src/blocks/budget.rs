@@ -41,7 +41,7 @@ pub(crate) struct Budget {
 
 impl Budget {
     /// `is_shared`: the device's memory is that of the host, as of a software device.
-    pub(crate) fn of(config: &TrainConfig, dataset: &Dataset, is_shared: bool) -> Self {
+    pub(crate) fn new(config: &TrainConfig, dataset: &Dataset, is_shared: bool) -> Self {
         let rest = 3.0 * rest_coefficients(config.sh_degree) as f64;
         let floats = BASE_FLOATS + rest;
         let bytes = |format| if format == StorageFormat::Single { 4.0 } else { 2.0 };
@@ -100,7 +100,7 @@ mod tests {
     fn a_device_that_shares_the_memory_of_the_host_has_room_for_the_copies_that_are_saved() {
         let dataset = Dataset { root: "".into(), views: vec![], points: vec![], skipped: vec![] };
         let config = TrainConfig::default();
-        let [alone, shared] = [false, true].map(|shared| Budget::of(&config, &dataset, shared));
+        let [alone, shared] = [false, true].map(|shared| Budget::new(&config, &dataset, shared));
         let floats = 14.0 + 3.0 * rest_coefficients(config.sh_degree) as f64;
         let more = shared.memory(1e6, 0.0, 8e9) - alone.memory(1e6, 0.0, 8e9);
         assert!((more - 12e6 * floats).abs() < 1.0, "{more}");

@@ -1,8 +1,8 @@
 //! The numbers of the tasks of a plan, and the views and points of its blocks.
 
 use super::budget::Budget;
-use super::partition::Part;
-use super::plan::{COARSE, PlanFile, Request, Row};
+use super::partition::BlockCells;
+use super::plan::{COARSE, PlanFile, PlanRow, Request};
 use super::visibility::Visibility;
 use crate::base::hash;
 use crate::base::random::Stream;
@@ -28,14 +28,14 @@ pub(super) struct Draft<'a> {
 
 impl Draft<'_> {
     /// The row of the coarse model.
-    pub(super) fn coarse(&self) -> Row {
+    pub(super) fn coarse(&self) -> PlanRow {
         let steps = COARSE_STEPS * self.config.steps as f64;
         let [views, points] = [self.thinned.len(), self.dataset.points.len()];
         self.row(COARSE.to_owned(), 0, [views, points], steps, self.config.max_gaussians as f64)
     }
 
     /// The rows of the blocks, round by round. The blocks of a round share its steps by their views.
-    pub(super) fn rows(&self, parts: &[Part], serving: &[Vec<usize>]) -> Vec<Row> {
+    pub(super) fn rows(&self, parts: &[BlockCells], serving: &[Vec<usize>]) -> Vec<PlanRow> {
         let all: usize = serving.iter().map(Vec::len).sum();
         let later = ROUND_STEPS * f64::from(self.request.rounds - 1);
         let mut rows = vec![];
@@ -61,13 +61,13 @@ impl Draft<'_> {
         [views, points]: [usize; 2],
         steps: f64,
         gaussians: f64,
-    ) -> Row {
+    ) -> PlanRow {
         let most = self.request.memory as f64;
         let budget = if round == 0 { self.budget.at_half_size() } else { self.budget };
         let fits = budget.gaussians(most);
         let gaussians = if self.request.blocks.is_some() { gaussians } else { gaussians.min(fits) };
-        let key = hash::of(id.as_bytes());
-        Row {
+        let key = hash::checksum(id.as_bytes());
+        PlanRow {
             round,
             views,
             points,
@@ -85,13 +85,13 @@ impl Draft<'_> {
     pub(super) fn blocks(
         &self,
         file: &PlanFile,
-        parts: &[Part],
+        parts: &[BlockCells],
         serving: &[Vec<usize>],
     ) -> Vec<Block> {
         let plan = file.checksum.as_str();
         let mut blocks = vec![self.block(COARSE, plan, [Cell::WORLD; 2], &self.thinned)];
         for (row, number) in file.blocks.iter().zip((0..parts.len()).cycle()) {
-            let Part { core, halo, .. } = parts[number];
+            let BlockCells { core, halo, .. } = parts[number];
             // In later rounds the surroundings are the neighbours' own.
             let halo = if row.round == 1 { halo } else { core };
             let mut block = self.block(&row.id, plan, [core, halo], &serving[number]);

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::plan::{BLOCKS, BlockPlan, COARSE, LAW, PLAN, PlanFile, Row};
+use super::plan::{BLOCKS, BlockPlan, COARSE, LAW, PLAN, PlanFile, PlanRow};
 use super::task::{self, TASKS, Task};
 use crate::base::output;
 use crate::camera::TrainingFrame;
@@ -78,7 +78,7 @@ impl BlockPlan {
         tasks
     }
 
-    fn training(&self, row: &Row, before: &str) -> Task {
+    fn training(&self, row: &PlanRow, before: &str) -> Task {
         let folder = task_folder(&row.id);
         let [config, run] = [CONFIG, "run"].map(|name| format!("{folder}/{name}"));
         let argv = ["nightsplat", "train", &folder, "--config", &config, "--out", &run, "--resume"];
@@ -95,7 +95,7 @@ impl BlockPlan {
     }
 
     /// The settings of a task, with paths from the plan's folder.
-    fn settings(&self, row: &Row) -> TrainConfig {
+    fn settings(&self, row: &PlanRow) -> TrainConfig {
         let memory = Some(CacheSize(self.file.memory));
         let shared = TrainConfig {
             dataset: task_folder(&row.id).into(),
@@ -126,7 +126,7 @@ impl BlockPlan {
 
     /// The schedule goes on where the round before ends. The views of a block are fewer, so that a step of it stands
     /// for several of the whole scene: it is as much faster. Only the last round has the cooldown.
-    fn schedule(&self, row: &Row) -> Schedule {
+    fn schedule(&self, row: &PlanRow) -> Schedule {
         let steps = |round: u8| self.file.round(round).map(|row| row.steps).sum::<u64>();
         let done = self.file.coarse.steps + (1..row.round).map(steps).sum::<u64>();
         let rate = row.steps as f64 / steps(row.round).max(1) as f64;
@@ -156,14 +156,14 @@ pub(super) fn task_folder(id: &str) -> String {
 /// What `train --frame` reads.
 fn frame_file(config: &TrainConfig) -> Result<String> {
     #[derive(Serialize)]
-    struct Frame {
+    struct BlockFrame {
         extent: Option<f64>,
         up: Option<[f64; 3]>,
         near: f64,
         frame: Option<TrainingFrame>,
     }
     let TrainConfig { extent, up, near, frame, .. } = *config;
-    toml::to_string(&Frame { extent, up, near, frame })
+    toml::to_string(&BlockFrame { extent, up, near, frame })
         .map_err(|error| Error::Usage(error.to_string()))
 }
 

@@ -14,7 +14,7 @@ use crate::photographs::dataset::block::{Block, Cell};
 use crate::results::export::{Format, Provenance};
 use crate::results::models;
 use crate::results::run::{self, RunDirectory, TRAINED_WITH};
-use crate::splats::joined::{MANIFEST, Manifest, Tile, VERSION};
+use crate::splats::joined::{MANIFEST, ModelTile, TileManifest, VERSION};
 use crate::splats::scene::{Gaussians, ply};
 use crate::{Error, Result};
 
@@ -24,7 +24,7 @@ const TILES: &str = "0";
 /// The end of a join.
 #[derive(Clone, Debug)]
 pub(crate) struct Joined {
-    pub(crate) manifest: Manifest,
+    pub(crate) manifest: TileManifest,
     /// Gaussians of the blocks outside their cores, which are left out.
     pub(crate) cropped: usize,
 }
@@ -35,7 +35,7 @@ pub(crate) fn join(
     folder: &Path,
     round: Option<u8>,
     same_device: bool,
-    mut observe: impl FnMut(&Tile),
+    mut observe: impl FnMut(&ModelTile),
 ) -> Result<Joined> {
     let plan = PlanFile::load(folder)?;
     let last = plan.rounds();
@@ -61,7 +61,7 @@ pub(crate) fn join(
         origin = tile_origin;
     }
     let count = tiles.iter().map(|tile| tile.count).sum();
-    let manifest = Manifest {
+    let manifest = TileManifest {
         version: VERSION,
         plan: plan.checksum.clone(),
         origin,
@@ -141,7 +141,7 @@ fn devices(folder: &Path, blocks: &[Block], same_device: bool) -> Result<Vec<Str
 }
 
 /// Writes the tile of a block; also returns the number of Gaussians left out, and the origin of its positions.
-fn write_tile(folder: &Path, model: &Path, block: &Block) -> Result<(Tile, usize, [f64; 3])> {
+fn write_tile(folder: &Path, model: &Path, block: &Block) -> Result<(ModelTile, usize, [f64; 3])> {
     let id = &block.id;
     let (mut gaussians, facts) = models::read(&run_of(folder, id))?;
     let before = gaussians.count;
@@ -167,7 +167,7 @@ fn write_tile(folder: &Path, model: &Path, block: &Block) -> Result<(Tile, usize
     }
     let sha256 = hash::hexadecimal(&Sha256::digest(&bytes));
     let bounds = bounds(&written);
-    let tile = Tile { id: name.to_owned(), file, count: written.count, bounds, sha256 };
+    let tile = ModelTile { id: name.to_owned(), file, count: written.count, bounds, sha256 };
     Ok((tile, before - written.count, origin))
 }
 
@@ -181,7 +181,7 @@ fn bounds(gaussians: &Gaussians) -> Option<Cell> {
 }
 
 /// The numbers that `eval` and others print of a run.
-fn save_metrics(folder: &Path, plan: &PlanFile, manifest: &Manifest) -> Result<()> {
+fn save_metrics(folder: &Path, plan: &PlanFile, manifest: &TileManifest) -> Result<()> {
     let steps: u64 = plan.blocks.iter().map(|row| row.steps).sum();
     let seconds = plan
         .blocks

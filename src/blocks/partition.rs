@@ -27,7 +27,7 @@ pub(crate) struct WeightedPoint {
 
 /// A cell with its surroundings.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Part {
+pub(crate) struct BlockCells {
     pub(crate) core: Cell,
     pub(crate) halo: Cell,
     /// The weight of the points in core and halo, relative to all points.
@@ -45,11 +45,15 @@ pub(crate) enum Until {
 
 /// The cells of a scene, in the order of the tree; `None` if points at one place cannot be split further. `up` is the
 /// scene's up direction.
-pub(crate) fn partition(points: &[WeightedPoint], up: DVec3, until: Until) -> Option<Vec<Part>> {
+pub(crate) fn partition(
+    points: &[WeightedPoint],
+    up: DVec3,
+    until: Until,
+) -> Option<Vec<BlockCells>> {
     let mut sorted = points.to_vec();
     sorted.sort_by(|a, b| by_position(a, b, 0));
     let total: f64 = sorted.iter().map(|point| point.weight).sum();
-    let mut leaves = vec![Leaf::new(sorted, Cell::WORLD, points, total)];
+    let mut leaves = vec![PartitionLeaf::new(sorted, Cell::WORLD, points, total)];
     loop {
         let next = match until {
             Until::Count(count) if leaves.len() >= count => None,
@@ -61,20 +65,20 @@ pub(crate) fn partition(points: &[WeightedPoint], up: DVec3, until: Until) -> Op
         };
         let Some(at) = next else { break };
         let halves = leaves[at].halves(up)?;
-        let new = halves.map(|(half, core)| Leaf::new(half, core, points, total));
+        let new = halves.map(|(half, core)| PartitionLeaf::new(half, core, points, total));
         leaves.splice(at..=at, new);
     }
     Some(leaves.into_iter().map(|leaf| leaf.part).collect())
 }
 
 /// A cell that is not split yet.
-struct Leaf {
+struct PartitionLeaf {
     /// Its points, sorted by position.
     points: Vec<WeightedPoint>,
-    part: Part,
+    part: BlockCells,
 }
 
-impl Leaf {
+impl PartitionLeaf {
     fn new(points: Vec<WeightedPoint>, core: Cell, all: &[WeightedPoint], total: f64) -> Self {
         let mut reach = HALO;
         let sides = sides(&points);
@@ -88,7 +92,7 @@ impl Leaf {
             all.iter().filter(|point| halo.contains(point.position)).copied().collect();
         inside.sort_by(|a, b| by_position(a, b, 0));
         let share = inside.iter().map(|point| point.weight).sum::<f64>() / total;
-        Self { points, part: Part { core, halo, share } }
+        Self { points, part: BlockCells { core, halo, share } }
     }
 
     /// The halves at the weighted median of the longest horizontal axis on which the points differ.
@@ -216,7 +220,7 @@ mod tests {
         assert!(parts.len() >= 6, "{}", parts.len());
         assert!(parts.iter().all(|part| part.share <= 0.2));
         let whole = partition(&street(100), DVec3::Y, Until::Share(1.0)).unwrap();
-        assert_eq!(whole, [Part { core: Cell::WORLD, halo: Cell::WORLD, share: 1.0 }]);
+        assert_eq!(whole, [BlockCells { core: Cell::WORLD, halo: Cell::WORLD, share: 1.0 }]);
     }
 
     #[test]

@@ -40,7 +40,7 @@ pub(crate) struct Request {
 /// The numbers of a task that trains.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Row {
+pub(crate) struct PlanRow {
     pub(crate) id: String,
     /// The number of the round, from 1; 0: the coarse model.
     pub(crate) round: u8,
@@ -69,10 +69,10 @@ pub(crate) struct PlanFile {
     pub(super) settings: String,
     /// Memory of a worker, bytes.
     pub(crate) memory: u64,
-    pub(crate) coarse: Row,
+    pub(crate) coarse: PlanRow,
     /// Round by round.
     #[serde(rename = "block")]
-    pub(crate) blocks: Vec<Row>,
+    pub(crate) blocks: Vec<PlanRow>,
 }
 
 impl BlockPlan {
@@ -89,7 +89,7 @@ impl PlanFile {
     }
 
     /// The blocks of a round, from 1.
-    pub(crate) fn round(&self, round: u8) -> impl Iterator<Item = &Row> {
+    pub(crate) fn round(&self, round: u8) -> impl Iterator<Item = &PlanRow> {
         self.blocks.iter().filter(move |row| row.round == round)
     }
 }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::budget::Budget;
 use super::draft::{Draft, block_id};
-use super::partition::{Part, Until, WeightedPoint, partition};
+use super::partition::{BlockCells, Until, WeightedPoint, partition};
 use super::plan::{BlockPlan, LAW, PlanFile, Request, VERSION};
 use super::visibility::Visibility;
 use crate::base::hash::{self, Hasher};
@@ -28,8 +28,8 @@ pub(crate) fn plan(planned: &PlannedRun, request: &Request) -> Result<BlockPlan>
             "has no points, by which a scene is divided; find them with `nightsplat pose`";
         return Err(Error::input(root, problem));
     }
-    let visibility = Visibility::of(dataset);
-    let budget = Budget::of(&config, dataset, request.is_shared);
+    let visibility = Visibility::new(dataset);
+    let budget = Budget::new(&config, dataset, request.is_shared);
     let parts = parts(dataset, &visibility, &config, &budget, request)?;
     let serving = visibility.serving(&parts);
     let shared = mean_share(&serving, visibility.training.len());
@@ -61,7 +61,7 @@ fn parts(
     config: &TrainConfig,
     budget: &Budget,
     request: &Request,
-) -> Result<Vec<Part>> {
+) -> Result<Vec<BlockCells>> {
     let shares = visibility.pixel_shares();
     let weighted = dataset.points.iter().zip(shares);
     let weighted: Vec<WeightedPoint> = weighted
@@ -152,7 +152,7 @@ fn settle(config: &mut TrainConfig, dataset: &Dataset) {
 }
 
 /// The checksum of a plan's numbers and cells.
-fn checksum(file: &PlanFile, parts: &[Part]) -> Result<String> {
+fn checksum(file: &PlanFile, parts: &[BlockCells]) -> Result<String> {
     let text = toml::to_string(file).map_err(|error| Error::Usage(error.to_string()))?;
     let mut hasher = Hasher::default();
     hasher.write(text.as_bytes());

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::partition::Part;
+use super::partition::BlockCells;
 use crate::photographs::dataset::{Dataset, Point, View};
 
 /// A view serves a block that contains this share of its points.
@@ -32,7 +32,7 @@ pub(crate) struct Visibility<'a> {
 
 impl<'a> Visibility<'a> {
     /// By the recorded tracks of the points; where there are none, every point in a view's frame counts as seen.
-    pub(crate) fn of(dataset: &'a Dataset) -> Self {
+    pub(crate) fn new(dataset: &'a Dataset) -> Self {
         let is_used = |view: &View| view.is_train() && view.has_photograph();
         let all = dataset.views.iter().enumerate();
         let training: Vec<usize> =
@@ -82,7 +82,7 @@ impl<'a> Visibility<'a> {
     }
 
     /// The views that serve each part, as ascending places in [`Self::training`].
-    pub(crate) fn serving(&self, parts: &[Part]) -> Vec<Vec<usize>> {
+    pub(crate) fn serving(&self, parts: &[BlockCells]) -> Vec<Vec<usize>> {
         let owner =
             |point: &Point| parts.iter().position(|part| part.core.contains(point.position));
         let part_of: Vec<Option<usize>> = self.dataset.points.par_iter().map(owner).collect();
@@ -179,7 +179,7 @@ mod tests {
         }
     }
 
-    fn parts(dataset: &Dataset, count: usize) -> Vec<Part> {
+    fn parts(dataset: &Dataset, count: usize) -> Vec<BlockCells> {
         let weighted = dataset.points.iter();
         let weighted =
             weighted.map(|point| WeightedPoint { position: point.position, weight: 1.0 });
@@ -189,7 +189,7 @@ mod tests {
     #[test]
     fn a_block_has_the_views_that_see_it_and_few_others() {
         let dataset = street(40, true);
-        let visibility = Visibility::of(&dataset);
+        let visibility = Visibility::new(&dataset);
         let serving = visibility.serving(&parts(&dataset, 4));
         assert!(serving[0].iter().all(|&view| view < 16), "{:?}", serving[0]);
         assert!((0..10).all(|view| serving[0].contains(&view)), "{:?}", serving[0]);
@@ -200,14 +200,14 @@ mod tests {
     #[test]
     fn without_tracks_what_is_in_the_frame_counts() {
         let dataset = street(40, false);
-        let serving = Visibility::of(&dataset).serving(&parts(&dataset, 2));
+        let serving = Visibility::new(&dataset).serving(&parts(&dataset, 2));
         assert!(serving[0].contains(&3) && !serving[0].contains(&36), "{:?}", serving[0]);
     }
 
     #[test]
     fn the_coarse_model_has_views_for_every_point() {
         let dataset = street(200, true);
-        let thinned = Visibility::of(&dataset).thinned();
+        let thinned = Visibility::new(&dataset).thinned();
         assert!(thinned.len() < 130, "{}", thinned.len());
         let has = |view: &u32| thinned.contains(&(*view as usize));
         assert!(
@@ -223,6 +223,6 @@ mod tests {
             point.views = views;
         }
         // Half a view, a view and a half, none; relative to their mean.
-        assert_eq!(Visibility::of(&dataset).pixel_shares(), [0.75, 2.25, 0.0]);
+        assert_eq!(Visibility::new(&dataset).pixel_shares(), [0.75, 2.25, 0.0]);
     }
 }

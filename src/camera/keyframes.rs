@@ -28,14 +28,14 @@ const VERSION: u32 = 1;
 
 /// A frame of a path.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Frame {
+pub(crate) struct PathFrame {
     /// World to view.
     pub(crate) view_from_world: DAffine3,
     /// The vertical field of view, radians.
     pub(crate) fov: Option<f64>,
 }
 
-impl Frame {
+impl PathFrame {
     /// The camera of the frame: a pinhole with its field of view, or the lens of `like`, of that or another size.
     pub(crate) fn camera(&self, like: &Camera, size: Option<[u32; 2]>) -> Camera {
         let resized = size.map_or(*like, |size| like.framed(size));
@@ -50,7 +50,7 @@ impl Frame {
 /// The frames of a file.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct FramePath {
-    pub(crate) frames: Vec<Frame>,
+    pub(crate) frames: Vec<PathFrame>,
     pub(crate) fps: Option<f64>,
     /// Width and height in pixels.
     pub(crate) size: Option<[u32; 2]>,
@@ -166,10 +166,10 @@ impl FramePath {
             let pose = pose.ok_or_else(|| {
                 format!("frame {number}: camera_to_world is no pose of 16 finite numbers")
             })?;
-            Ok(Frame { view_from_world: pose, fov: field_of_view(frame.fov)? })
+            Ok(PathFrame { view_from_world: pose, fov: field_of_view(frame.fov)? })
         };
         let all = file.camera_path.iter().enumerate().map(frame);
-        let all: Vec<Frame> = all.collect::<Result<_, String>>()?;
+        let all: Vec<PathFrame> = all.collect::<Result<_, String>>()?;
         let frames = match options.frames {
             Some(count) if !all.is_empty() => {
                 (0..count).map(|index| all[index * all.len() / count]).collect()
@@ -292,7 +292,7 @@ fn knots(file: &Keyframes, up: DVec3) -> Result<Vec<Knot>, String> {
 }
 
 /// The frame at a time between the first and the last knot.
-fn interpolated(knots: &[Knot], is_loop: bool, time: f64) -> Frame {
+fn interpolated(knots: &[Knot], is_loop: bool, time: f64) -> PathFrame {
     let last = knots.len() - 1;
     let segment = knots.partition_point(|knot| knot.time <= time).clamp(1, last.max(1)) - 1;
     let (from, to) = (&knots[segment], &knots[(segment + 1).min(last)]);
@@ -330,7 +330,10 @@ fn interpolated(knots: &[Knot], is_loop: bool, time: f64) -> Frame {
     let turn = a * from.turn + c * to.turn + length * (b * from_tangent.1 + d * to_tangent.1);
     let fov = from.fov.zip(to.fov).map(|(from, to)| from + (to - from) * t * t * (3.0 - 2.0 * t));
     let rotation = DQuat::from_vec4(turn).normalize();
-    Frame { view_from_world: DAffine3::from_rotation_translation(rotation, center).inverse(), fov }
+    PathFrame {
+        view_from_world: DAffine3::from_rotation_translation(rotation, center).inverse(),
+        fov,
+    }
 }
 
 /// The weights of the first value, its tangent, the second value and its tangent.
@@ -377,7 +380,7 @@ mod tests {
         {"position": [4, 0, 0], "target": [0, 0, 0]}, {"position": [0, 0, 4], "target": [0, 0, 0]},
         {"position": [-4, 0, 0], "target": [0, 0, 0]}, {"position": [0, 0, -4], "target": [0, 0, 0]}]}"#;
 
-    fn center(frame: &Frame) -> DVec3 {
+    fn center(frame: &PathFrame) -> DVec3 {
         frame.view_from_world.inverse().translation
     }
 

@@ -12,11 +12,11 @@ use crate::splats::scene::{DeviceGaussians, Gaussians};
 
 /// A model on a device. Use it from one thread at a time.
 #[derive(Debug)]
-pub struct NspModel(pub(super) Object<Loaded>);
+pub struct NspModel(pub(super) Object<LoadedModel>);
 
 /// A model and its Gaussians on the device.
 #[derive(Debug)]
-pub(super) struct Loaded {
+pub(super) struct LoadedModel {
     /// On the host, to be joined with others.
     pub(super) model: Model,
     pub(super) on_device: DeviceGaussians,
@@ -25,7 +25,7 @@ pub(super) struct Loaded {
 impl NspModel {
     pub(super) fn new(gpu: &Gpu, model: Model) -> Result<Self, Failure> {
         let on_device = model.gaussians.upload(gpu)?;
-        Ok(Self(Object::new(Loaded { model, on_device })))
+        Ok(Self(Object::new(LoadedModel { model, on_device })))
     }
 }
 
@@ -208,7 +208,7 @@ pub unsafe extern "C" fn nsp_model_info(
 ) -> NspResult {
     guard("nsp_model_info", || {
         // SAFETY: as the caller promises.
-        let Loaded { model, .. } = unsafe { object(model, "model")? }.0.get("the model")?;
+        let LoadedModel { model, .. } = unsafe { object(model, "model")? }.0.get("the model")?;
         let filled = NspModelInfo {
             struct_size: size_of::<NspModelInfo>(),
             count: model.gaussians.count as u32,

@@ -11,7 +11,7 @@ pub use ash::vk::{
 use super::camera::NspCamera;
 use super::device::NspDevice;
 use super::error::{Failure, NspResult, Object, guard};
-use super::model::{Loaded, NspModel};
+use super::model::{LoadedModel, NspModel};
 use super::structs::{Sized0, destroy, give, object, object_mut, read, write};
 use crate::camera::Camera;
 use crate::gpu::{Gpu, HostFrame, HostImage, ImageFormat, ImageState};
@@ -175,7 +175,8 @@ pub unsafe extern "C" fn nsp_renderer_create(
         unsafe {
             give(renderer, "renderer", || {
                 let gpu = object(device, "device")?.0.get("the device")?;
-                let Loaded { model, on_device } = object(model, "model")?.0.get("the model")?;
+                let LoadedModel { model, on_device } =
+                    object(model, "model")?.0.get("the model")?;
                 check_device(gpu, on_device)?;
                 let settings = RenderSettings { purpose: Purpose::Show, ..model.render_settings() };
                 let renderer = Renderer::new(gpu, settings)?;
@@ -246,7 +247,11 @@ pub unsafe extern "C" fn nsp_record_render(
 
 /// # Safety
 /// `render` says the truth.
-unsafe fn record(shown: &mut Shown, loaded: &Loaded, render: &NspRender) -> Result<(), Failure> {
+unsafe fn record(
+    shown: &mut Shown,
+    loaded: &LoadedModel,
+    render: &NspRender,
+) -> Result<(), Failure> {
     check_device(&shown.gpu, &loaded.on_device)?;
     if render.commands == vk::CommandBuffer::null() {
         return Err(Failure::usage("NspRender::commands is NULL"));

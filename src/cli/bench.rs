@@ -257,7 +257,10 @@ impl Findings {
         let not_covered = self.not_covered().join(", ");
         let stage_table = table::aligned(&rows);
         let outcomes = self.checked.outcomes();
-        let more = [self.ceilings.map(|own| own.as_text()), self.steady.map(|own| own.as_text())];
+        let more = [
+            self.ceilings.map(|section| section.as_text()),
+            self.steady.map(|section| section.as_text()),
+        ];
         let more: String = more.into_iter().flatten().map(|line| line + "\n").collect();
         format!(
             "{head}\n\n{kernel_table}{outcomes}\nnot covered: {not_covered}\n\n{stage_table}{more}"
@@ -268,7 +271,7 @@ impl Findings {
     fn speed(&self, time: &KernelTime) -> String {
         let speed = format!("{:.1}", time.speed() * 1e-9);
         match self.ceilings {
-            Some(own) => format!("{speed} ({:.0} %)", 100.0 * time.speed() / own.bytes),
+            Some(peak) => format!("{speed} ({:.0} %)", 100.0 * time.speed() / peak.bytes),
             None => speed,
         }
     }

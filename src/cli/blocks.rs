@@ -13,7 +13,7 @@ use super::train::TrainOptions;
 use super::{driver, finish, table, word};
 use crate::Error;
 use crate::base::output::{check_writable, printable};
-use crate::blocks::{self, BlockPlan, MAX_ROUNDS, Request, Row};
+use crate::blocks::{self, BlockPlan, MAX_ROUNDS, PlanRow, Request};
 use crate::gpu::DeviceChoice;
 use crate::train::{CacheSize, PlanSource};
 
@@ -155,7 +155,7 @@ fn plan(args: &PlanArgs) -> Result<()> {
 /// A table of the tasks, and their sums.
 fn summary(plan: &BlockPlan) -> String {
     let mebibytes = |bytes: u64| (bytes >> 20).to_string();
-    let row = |row: &Row| {
+    let row = |row: &PlanRow| {
         let numbers = [row.views, row.points, row.gaussians].map(|number| number.to_string());
         let [views, points, gaussians] = numbers;
         let (steps, memory, disk) =

@@ -60,7 +60,7 @@ pub fn run(args: &CompareArgs) -> Result<()> {
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),
         with_pictures: args.report.is_some(),
     };
-    let comparison = RunComparison::of(&args.runs, &options)?;
+    let comparison = RunComparison::new(&args.runs, &options)?;
     let mut wrote = String::new();
     if let Some(path) = &args.report {
         write_whole(path, comparison.html().as_bytes())?;
@@ -70,7 +70,8 @@ pub fn run(args: &CompareArgs) -> Result<()> {
     if args.json {
         return Ok(writeln!(out, "{:#}", comparison.json())?);
     }
-    let tables = [comparison.means(), comparison.views()].map(|own| table::of(&own));
+    let tables = [comparison.means(), comparison.views()]
+        .map(|table_of_scores| table::text(&table_of_scores));
     writeln!(out, "{}", tables.join("\n"))?;
     for [key, values] in comparison.settings() {
         writeln!(out, "{key}: {values}")?;

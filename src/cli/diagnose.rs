@@ -68,7 +68,7 @@ impl Selection for OfPhotographs {
 
 /// The output of `--json`.
 #[derive(Serialize)]
-struct Output<'a> {
+struct DiagnoseOutput<'a> {
     device: &'a str,
     #[serde(flatten)]
     diagnosis: &'a Diagnosis,
@@ -107,7 +107,8 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     let text = if args.json {
         let residual_transmittance =
             run.as_ref().map(|(_, residual_transmittances)| residual_transmittances);
-        let output = Output { device, diagnosis: &diagnosis, plan: &plan, residual_transmittance };
+        let output =
+            DiagnoseOutput { device, diagnosis: &diagnosis, plan: &plan, residual_transmittance };
         let json = serde_json::to_string_pretty(&output);
         json.map_err(|error| Error::output("standard output", error.to_string()))? + "\n"
     } else {
@@ -134,7 +135,8 @@ fn holes(
         FinishedRun::open(run, Some(&args.dataset), &driver::opener(args.device.as_ref()))?;
     let mut found = BTreeMap::new();
     for view in &dataset.views {
-        let residual_transmittance = ResidualTransmittance::of(&model_renderer.render(view)?, view);
+        let residual_transmittance =
+            ResidualTransmittance::measure(&model_renderer.render(view)?, view);
         found.extend(residual_transmittance.map(|one| (view.name.clone(), one)));
     }
     let views = found.iter().map(|(name, one)| (name.as_str(), one.mean));
@@ -159,7 +161,7 @@ fn text(device: &str, dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> 
         diagnosis::sizes(views),
         dataset.points.len()
     );
-    text += &table::of(&diagnosis::table(diagnosis));
+    text += &table::text(&diagnosis::table(diagnosis));
     text.push('\n');
     for [name, figures] in diagnosis::scene_facts(&diagnosis.scene) {
         text += &format!("{name:<12}{figures}\n");

@@ -28,8 +28,8 @@ pub struct DoctorArgs {
 
 /// What `--json` prints.
 #[derive(Serialize)]
-struct Output<'a> {
-    devices: Vec<Listed<'a>>,
+struct DoctorOutput<'a> {
+    devices: Vec<ListedDevice<'a>>,
     /// Index of the default device.
     chosen: Option<usize>,
     /// The variables of a scheduler that selected it.
@@ -40,7 +40,7 @@ struct Output<'a> {
 }
 
 #[derive(Serialize)]
-struct Listed<'a> {
+struct ListedDevice<'a> {
     #[serde(flatten)]
     report: &'a DeviceReport,
     /// The names of unmet requirements.
@@ -75,13 +75,13 @@ pub fn run(args: &DoctorArgs) -> Result<()> {
         PROGRAMS.iter().map(|(name, _)| (*name, on_path(name))).collect();
     let verdict = verdict(chosen.map(|index| &devices[index]), reason.as_deref());
     let text = if args.json {
-        let listed = |(report, self_test)| Listed {
+        let listed = |(report, self_test)| ListedDevice {
             report,
             missing: DeviceReport::all_missing(report).collect(),
             self_test,
         };
         let devices = devices.iter().zip(self_tests).map(listed).collect();
-        serde_json::to_string_pretty(&Output { devices, chosen, reason, programs, verdict })?
+        serde_json::to_string_pretty(&DoctorOutput { devices, chosen, reason, programs, verdict })?
     } else {
         table(&devices, &self_tests) + &program_lines(&programs) + &verdict
     };

@@ -67,8 +67,8 @@ fn check(device: &DeviceReport, index: usize) -> Result<()> {
 /// The file of this device, driver and version of ours.
 fn verdict_path(device: &DeviceReport) -> Option<PathBuf> {
     let DeviceReport { vendor, device, driver_version, .. } = device;
-    let own = env!("CARGO_PKG_VERSION");
-    Some(cache_folder()?.join(format!("{vendor:x}-{device:x}-{driver_version:x}-{own}.driver")))
+    let version = env!("CARGO_PKG_VERSION");
+    Some(cache_folder()?.join(format!("{vendor:x}-{device:x}-{driver_version:x}-{version}.driver")))
 }
 
 fn keep(path: &Path, verdict: &str) {

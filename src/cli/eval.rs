@@ -121,7 +121,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     if args.json {
         return Ok(writeln!(out, "{:#}", scored.json())?);
     }
-    write!(out, "{}", table::of(&scored.evaluation.table()))?;
+    write!(out, "{}", table::text(&scored.evaluation.table()))?;
     scored.notes().iter().try_for_each(|note| writeln!(out, "{note}"))?;
     drop(out);
     let wrote = args.report.iter().chain(&images).map(|path| path.display().to_string());

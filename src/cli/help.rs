@@ -46,7 +46,7 @@ const GROUPS: [(&str, &str); 6] = [
 
 /// Whether a list of names contains a name.
 fn lists(names: &str, name: &str) -> bool {
-    names.split_whitespace().any(|own| own == name)
+    names.split_whitespace().any(|listed| listed == name)
 }
 
 /// The command line; with `everything`, its help shows all options.
@@ -57,7 +57,7 @@ pub(super) fn command(everything: bool) -> Command {
 fn with_help(command: Command, everything: bool) -> Command {
     let command = command.mut_subcommands(|inner| with_help(inner, everything));
     let name = command.get_name().to_owned();
-    let common = COMMON.iter().find(|(own, _)| *own == name).map(|(_, options)| *options);
+    let common = COMMON.iter().find(|(listed, _)| *listed == name).map(|(_, options)| *options);
     let is_training = ["train", "check", "sweep"].contains(&name.as_str());
     let help = |name: &'static str, text: &'static str| {
         Arg::new(name).long(name).action(ArgAction::HelpShort).help(text).display_order(999)
@@ -69,10 +69,11 @@ fn with_help(command: Command, everything: bool) -> Command {
         None => command,
     };
     let command = command.mut_args(|arg| {
-        let is_rare = common.zip(arg.get_long()).is_some_and(|(common, own)| !lists(common, own));
-        let group = GROUPS
-            .iter()
-            .find(|(_, names)| is_training && arg.get_long().is_some_and(|own| lists(names, own)));
+        let is_rare =
+            common.zip(arg.get_long()).is_some_and(|(common, option)| !lists(common, option));
+        let group = GROUPS.iter().find(|(_, names)| {
+            is_training && arg.get_long().is_some_and(|option| lists(names, option))
+        });
         let arg = match (everything, group) {
             (false, _) => arg.help_heading(None::<&str>).hide_short_help(is_rare),
             (true, Some((heading, _))) if arg.get_help_heading().is_none() => {

@@ -32,6 +32,7 @@ const OPTIONS: [(&str, &str); 11] = [
 /// The message for a command line with an option of another trainer.
 pub fn hint(error: &clap::Error) -> Option<String> {
     let Some(ContextValue::String(name)) = error.get(ContextKind::InvalidArg) else { return None };
-    let (_, ours) = OPTIONS.iter().find(|(names, _)| names.split(' ').any(|own| own == name))?;
+    let (_, ours) =
+        OPTIONS.iter().find(|(names, _)| names.split(' ').any(|option| option == name))?;
     Some(format!("there is no `{name}` here; use {ours}"))
 }

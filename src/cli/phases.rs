@@ -40,8 +40,10 @@ impl Phases {
 
     /// The spans that are phases.
     pub fn filter() -> FilterFn {
-        let is_phase = |own: &Metadata<'_>| {
-            own.is_span() && *own.level() == Level::INFO && own.target().starts_with("nightsplat")
+        let is_phase = |metadata: &Metadata<'_>| {
+            metadata.is_span()
+                && *metadata.level() == Level::INFO
+                && metadata.target().starts_with("nightsplat")
         };
         filter_fn(is_phase as fn(&Metadata<'_>) -> bool).with_max_level_hint(LevelFilter::INFO)
     }

@@ -10,7 +10,9 @@ use indicatif::ProgressBar;
 
 use super::{driver, finish, progress_bar, word};
 use crate::gpu::DeviceChoice;
-use crate::photographs::pose::{Mapper, Matcher, PoseOptions, Posed, Progress, describe, estimate};
+use crate::photographs::pose::{
+    Mapper, Matcher, PoseOptions, PoseProgress, Posed, describe, estimate,
+};
 
 /// Estimate the cameras of dark photographs with COLMAP, and write a dataset for `train`.
 ///
@@ -79,12 +81,12 @@ pub fn run(args: &PoseArgs) -> Result<()> {
     let bar: RefCell<Option<ProgressBar>> = RefCell::default();
     let Posed { photographs, placed, bright, lenses } =
         estimate(&args.options(), &|progress| match progress {
-            Progress::Line(line) => {
+            PoseProgress::Line(line) => {
                 // A closed standard error is no reason to stop.
                 let seconds = begin.elapsed().as_secs_f64();
                 let _ = writeln!(std::io::stderr(), "{seconds:5.0} s  {line}");
             }
-            Progress::Photographs { done, all } => {
+            PoseProgress::Photographs { done, all } => {
                 let mut bar = bar.borrow_mut();
                 bar.get_or_insert_with(|| progress_bar(all)).set_position(done as u64);
                 if done == all {

@@ -110,7 +110,7 @@ impl Reporter {
     fn draw(&mut self, event: Event<'_>) {
         match event {
             Event::Started { step, memory, .. } => {
-                say(&foreseen(memory));
+                print_line(&foreseen(memory));
                 self.bar = ProgressBar::new(self.steps).with_position(step);
                 self.bar.set_style(style(self.may_end_early));
             }
@@ -125,7 +125,7 @@ impl Reporter {
             }
             Event::Evaluated { step, evaluation } => {
                 if let Some(line) = summary(evaluation).filter(|_| step < self.steps) {
-                    self.bar.suspend(|| say(&format!("step {step}: {line}")));
+                    self.bar.suspend(|| print_line(&format!("step {step}: {line}")));
                 }
             }
             Event::Finished(_) => self.bar.finish_and_clear(),
@@ -135,14 +135,16 @@ impl Reporter {
 
     fn write(&mut self, event: Event<'_>) {
         match event {
-            Event::Started { memory, .. } => say(&foreseen(memory)),
-            Event::Step(report) if self.is_due() => say(&self.line(report)),
+            Event::Started { memory, .. } => print_line(&foreseen(memory)),
+            Event::Step(report) if self.is_due() => print_line(&self.line(report)),
             Event::HeldOut { step, psnr } => {
-                say(&format!("step {step}: held-out views {psnr:.2} dB against their targets"));
+                print_line(&format!(
+                    "step {step}: held-out views {psnr:.2} dB against their targets"
+                ));
             }
             Event::Evaluated { step, evaluation } => {
                 if let Some(line) = summary(evaluation).filter(|_| step < self.steps) {
-                    say(&format!("step {step}: {line}"));
+                    print_line(&format!("step {step}: {line}"));
                 }
             }
             _ => {}
@@ -269,7 +271,7 @@ fn duration(seconds: f64) -> String {
     }
 }
 
-fn say(line: &str) {
+fn print_line(line: &str) {
     // A closed standard error is no reason to stop.
     let _ = writeln!(std::io::stderr(), "{line}");
 }

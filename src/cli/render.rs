@@ -8,8 +8,8 @@ use anyhow::Result;
 mod shots;
 
 use self::shots::{Shot, shots};
-use super::words::Words;
-use super::{ImageFormat, driver, finish, progress_bar, word};
+use super::words::NamedValues;
+use super::{OutputFormat, driver, finish, progress_bar, word};
 use crate::Error;
 use crate::base::output::{check_writable, create_folder, printable};
 use crate::camera::Easing;
@@ -64,7 +64,7 @@ pub struct RenderArgs {
     pub fov: Option<f64>,
     /// Background: black, white, grey, R,G,B from 0 to 1, or #rrggbb
     #[arg(long, value_name = "COLOUR", default_value = "black")]
-    pub background: Background,
+    pub background: BackgroundColor,
     /// Also write a video, with ffmpeg, or an animated PNG for FILE.png
     #[arg(long, value_name = "FILE")]
     pub video: Option<PathBuf>,
@@ -77,7 +77,7 @@ pub struct RenderArgs {
     /// Layer: rgb, denoised, depth, normal, alpha, transmittance; of a model that has it: depth-feature, structure,
     /// illumination, noise. Depth is the median depth, in colours from near (violet) to far (yellow) in PNG, in world
     /// units in EXR [default: denoised with a denoiser, else rgb]
-    #[arg(long, value_parser = Words::<RenderLayer>::new(RenderLayer::ALL.map(RenderLayer::name)))]
+    #[arg(long, value_parser = NamedValues::<RenderLayer>::new(RenderLayer::ALL.map(RenderLayer::name)))]
     pub layer: Option<RenderLayer>,
     /// Depths at the ends of the colours, in world units [default: of each image its own]
     #[arg(long, value_name = "NEAR,FAR")]
@@ -95,7 +95,7 @@ pub struct RenderArgs {
     pub lamp: bool,
     /// Image format
     #[arg(long, value_enum, default_value_t)]
-    pub format: ImageFormat,
+    pub format: OutputFormat,
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the run's]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
@@ -188,9 +188,9 @@ impl FromStr for Size {
 
 /// A colour, display-referred.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Background(pub [f32; 3]);
+pub struct BackgroundColor(pub [f32; 3]);
 
-impl FromStr for Background {
+impl FromStr for BackgroundColor {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -204,7 +204,8 @@ impl FromStr for Background {
             "grey" | "gray" => Some([0.5; 3]),
             _ => match text.strip_prefix('#') {
                 Some(digits) => hex(digits),
-                None => numbers(text).filter(|all| all.iter().all(|own| (0.0..=1.0).contains(own))),
+                None => numbers(text)
+                    .filter(|all| all.iter().all(|channel| (0.0..=1.0).contains(channel))),
             },
         };
         color.map(Self).ok_or_else(|| {
@@ -228,8 +229,8 @@ impl FromStr for DepthRange {
 
 /// This many finite numbers, separated by commas.
 fn numbers<const N: usize>(text: &str) -> Option<[f32; N]> {
-    let all: Option<Vec<f32>> = text.split(',').map(|own| own.trim().parse().ok()).collect();
-    all?.try_into().ok().filter(|all: &[f32; N]| all.iter().all(|own| own.is_finite()))
+    let all: Option<Vec<f32>> = text.split(',').map(|number| number.trim().parse().ok()).collect();
+    all?.try_into().ok().filter(|all: &[f32; N]| all.iter().all(|number| number.is_finite()))
 }
 
 /// The views to render.
@@ -256,12 +257,12 @@ impl SplitChoice {
 /// Renders the views or the path.
 pub fn run(args: &RenderArgs) -> Result<()> {
     let RenderArgs { run, out, layer, view_exposure, format, device, .. } = args;
-    if let Some(video) = args.video.as_ref().filter(|_| *format == ImageFormat::Exr) {
+    if let Some(video) = args.video.as_ref().filter(|_| *format == OutputFormat::Exr) {
         let problem =
             format!("--video {} requires PNG frames; leave out --format exr", video.display());
         return Err(Error::Usage(problem).into());
     }
-    if args.light == Light::Linear && *format != ImageFormat::Exr {
+    if args.light == Light::Linear && *format != OutputFormat::Exr {
         let problem = "--as linear is not clamped, and needs floats; add --format exr";
         return Err(Error::Usage(problem.to_owned()).into());
     }
@@ -285,7 +286,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
         };
         model_renderer.set_lamp(Some(lamp.ok_or_else(missing)?))?;
     }
-    let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
+    let exposures = if *view_exposure { Some(ViewExposures::load(run)?) } else { None };
     let (shots, fps) = shots(args, &config, &dataset)?;
     let scene = match args.light {
         Light::Target => None,
@@ -312,7 +313,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
             };
             let photograph = clipped.add(photograph_of(&image, &inverse));
             match format {
-                ImageFormat::Exr => {
+                OutputFormat::Exr => {
                     photograph.save_exr_with(&path, &[(STOPS, inverse.stops_to_target() as f32)])
                 }
                 _ => format.save(&photograph, &path),
@@ -339,7 +340,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     finish(&wrote, &format!("nightsplat export {} --format html", word(run)))
 }
 
-fn file(folder: &Path, name: &str, format: ImageFormat) -> PathBuf {
+fn file(folder: &Path, name: &str, format: OutputFormat) -> PathBuf {
     folder.join(format!("{name}.{}", format.extension()))
 }
 
@@ -350,7 +351,7 @@ fn save_numbers(
     layer: RenderLayer,
     path: &Path,
 ) -> crate::Result<()> {
-    if args.format == ImageFormat::Exr {
+    if args.format == OutputFormat::Exr {
         return image.save_exr_as_stored(path);
     }
     match layer {

@@ -8,7 +8,7 @@ use clap::builder::ValueParser;
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches, ValueHint};
 use toml::{Table, Value};
 
-use super::words::{self, Words};
+use super::words::{self, NamedValues};
 use crate::base::settings::{Rule, Setting};
 use crate::photographs::tone::{CurveChoice, GainChoice, Profile, Tone, ToneSettings};
 use crate::train::settings::SETTINGS;
@@ -64,7 +64,7 @@ impl<S: Selection> SettingOptions<S> {
             );
             match (row.key.as_ref(), text.as_str()) {
                 ("max_resolution", "none") => layer.push(&row.key, 0.into(), origin)?,
-                (key, text) => layer.say(key, text, origin)?,
+                (key, text) => layer.set_text(key, text, origin)?,
             }
         }
         Ok(())
@@ -87,7 +87,7 @@ impl<S: Selection> Args for SettingOptions<S> {
             command.arg(match (value, row.rule) {
                 (Some(value), Rule::OneOf(words)) => {
                     let words = words.iter().copied();
-                    arg.value_name(value).value_parser(Words::<String>::new(words))
+                    arg.value_name(value).value_parser(NamedValues::<String>::new(words))
                 }
                 (Some(value), _) => arg.value_name(value).value_parser(ValueParser::string()),
                 (None, _) => arg.action(ArgAction::SetTrue),

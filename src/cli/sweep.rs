@@ -33,11 +33,11 @@ use serde::Serialize;
 use self::grid::Grid;
 use self::leaderboard::Leaderboard;
 use self::options::Options;
-use self::point::{ADAPTIVE, Axis, OFFSET, PARTS};
-use self::rows::Rows;
+use self::point::{ADAPTIVE, OFFSET, PARTS, SweepAxis};
+use self::rows::SweepResults;
 pub(super) use self::run::parsed;
 use self::run::{Run, absolute, difference};
-use self::runner::Failure;
+use self::runner::FailedPoint;
 use super::eval::LpipsRange;
 use super::{driver, finish, progress_bar};
 use crate::Error;
@@ -139,7 +139,7 @@ fn swept(
     title: &str,
     intro: &[String],
     links: &[[String; 2]],
-) -> Result<Option<(Rows, Vec<Failure>)>> {
+) -> Result<Option<(SweepResults, Vec<FailedPoint>)>> {
     check_writable(&args.out)?;
     let (runs, dataset) = plan(args)?;
     let mut left = vec![];
@@ -168,7 +168,7 @@ fn swept(
         let folders: Vec<&Path> = finished.map(|run| run.folder.as_path()).collect();
         scores::add_lpips(&folders, &open(first)?, weights, args.lpips_range.into())?;
     }
-    let rows = Rows::new(&runs, args.table.and_then(Grid::baseline));
+    let rows = SweepResults::new(&runs, args.table.and_then(Grid::baseline));
     let settings = settings(&runs, &rows.seeds, &args.options.shared);
     let leaderboard = Leaderboard {
         rows: &rows,
@@ -191,7 +191,7 @@ fn swept(
     if args.json {
         writeln!(out, "{:#}", rows.json(&dataset.root, &failures))?;
     } else {
-        let tables = [leaderboard.table(), rows.costs()].map(|table| super::table::of(&table));
+        let tables = [leaderboard.table(), rows.costs()].map(|table| super::table::text(&table));
         writeln!(out, "{}", tables.join("\n"))?;
         let out = args.out.display();
         finish(&format!("{out}/index.html, {out}/costs.html"), &format!("open {out}/index.html"))?;
@@ -208,13 +208,13 @@ fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
     let lists = [("alpha", &args.alpha), ("beta", &args.beta), (OFFSET, &args.offset)];
     let mut axes = vec![];
     for (key, list) in lists {
-        axes.extend(list.as_deref().map(|list| Axis::new(key, list)).transpose()?);
+        axes.extend(list.as_deref().map(|list| SweepAxis::new(key, list)).transpose()?);
     }
     for (key, list) in &args.options.lists {
-        axes.push(Axis::new(key, list)?);
+        axes.push(SweepAxis::new(key, list)?);
     }
     for list in &args.grid {
-        axes.push(Axis::parse(list)?);
+        axes.push(SweepAxis::parse(list)?);
     }
     let shared = &args.options.shared;
     if args.table == Some(Grid::Parts) && shared.iter().any(|it| it == "--model" || it == "--parts")
@@ -281,7 +281,7 @@ fn claim(args: &SweepArgs, runs: &[Run]) -> crate::Result<()> {
 /// The contents of `sweep.toml`: the sweep without the values of its lists.
 fn manifest(args: &SweepArgs, runs: &[Run]) -> crate::Result<String> {
     #[derive(Serialize)]
-    struct Manifest<'a> {
+    struct SweepManifest<'a> {
         dataset: String,
         train: &'a [String],
         lists: Vec<&'a str>,
@@ -291,7 +291,7 @@ fn manifest(args: &SweepArgs, runs: &[Run]) -> crate::Result<String> {
     lists.sort_unstable();
     lists.dedup();
     let manifest =
-        Manifest { dataset: absolute(&args.dataset)?, train: &args.options.shared, lists };
+        SweepManifest { dataset: absolute(&args.dataset)?, train: &args.options.shared, lists };
     toml::to_string(&manifest).map_err(|error| Error::Usage(error.to_string()))
 }
 
@@ -318,6 +318,6 @@ fn adaptive_offset(runs: &[Run], dataset: &Dataset) -> Option<f64> {
     // Unreadable photographs are reported by the training.
     let images = dataset.train_views().filter_map(|view| view.loaded().ok().flatten());
     let offsets: Vec<f64> =
-        images.map(|image| run.config.tone.offset(Statistics::of(&image.data).ratio())).collect();
+        images.map(|image| run.config.tone.offset(Statistics::new(&image.data).ratio())).collect();
     Some(offsets.iter().sum::<f64>() / offsets.len() as f64)
 }

@@ -1,11 +1,11 @@
 //! Tables for the terminal.
 
 use crate::base::output::printable;
-use crate::results::report::{Column, Table};
+use crate::results::report::{Column, NumberTable};
 
 /// A table of the report as text.
-pub(super) fn of(table: &Table) -> String {
-    let Table { label, columns, rows, .. } = table;
+pub(super) fn text(table: &NumberTable) -> String {
+    let NumberTable { label, columns, rows, .. } = table;
     let mut lines = vec![vec![label.clone()]];
     lines[0].extend(columns.iter().map(|column| column.name.clone()));
     for (name, values) in rows {

@@ -10,11 +10,11 @@ pub mod list;
 #[derive(Clone, Debug, clap::Args)]
 pub struct ToneArgs {
     #[command(subcommand)]
-    command: Command,
+    command: ToneCommand,
 }
 
 #[derive(Clone, Debug, clap::Subcommand)]
-enum Command {
+enum ToneCommand {
     List(list::ListArgs),
     Apply(Box<apply::ApplyArgs>),
     Fit(fit::FitArgs),
@@ -23,8 +23,8 @@ enum Command {
 /// Runs the subcommand.
 pub fn run(args: &ToneArgs) -> Result<()> {
     match &args.command {
-        Command::List(args) => list::run(args),
-        Command::Apply(args) => apply::run(args),
-        Command::Fit(args) => fit::run(args),
+        ToneCommand::List(args) => list::run(args),
+        ToneCommand::Apply(args) => apply::run(args),
+        ToneCommand::Fit(args) => fit::run(args),
     }
 }

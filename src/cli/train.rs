@@ -113,7 +113,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
     let (is_text, is_quiet) = (form != ProgressForm::Json, form == ProgressForm::None);
     let mut out = std::io::stdout();
-    let facts = RunFacts::of(&gpu, &config, plan.as_ref(), &dataset);
+    let facts = RunFacts::new(&gpu, &config, plan.as_ref(), &dataset);
     if is_text && !is_quiet {
         let plan = plan.as_ref().map(diagnose::decisions).unwrap_or_default();
         write!(out, "{}{plan}", facts.text())?;
@@ -150,8 +150,8 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     if let Some(line) = summary(&evaluation) {
         writeln!(out, "{line}")?;
     }
-    if let Some(known) = config.tone.knows_references() {
-        writeln!(out, "{}", eval::with_reference(&known))?;
+    if let Some(reference_settings) = config.tone.knows_references() {
+        writeln!(out, "{}", eval::with_reference(&reference_settings))?;
     }
     if let Some(label) = evaluation.label() {
         writeln!(out, "the scores are {label}")?;

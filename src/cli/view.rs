@@ -13,11 +13,11 @@ use crate::camera::Camera;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::results::export::Provenance;
-use crate::results::export::page::{Bookmark, Page};
+use crate::results::export::page::{Bookmark, ModelPage};
 use crate::results::finished_run::{config_of_file, is_model};
 use crate::results::run::{self, Requests};
 use crate::splats::render::RenderSettings;
-use crate::splats::scene::{Facts, Gaussians, Shape};
+use crate::splats::scene::{Gaussians, ModelFacts, Shape};
 use crate::train::TrainConfig;
 use crate::{Error, Initialization};
 
@@ -109,11 +109,16 @@ fn opened(args: &ViewArgs) -> Result<Arc<Site>> {
     let config = TrainConfig { dataset: path.clone(), ..TrainConfig::default() };
     let pictures = Pictures::load(config, gpu)?;
     let feed = Feed::of_gaussians(&points(pictures.dataset())?);
-    of_dataset(path, feed, pictures, &Facts::default())
+    of_dataset(path, feed, pictures, &ModelFacts::default())
 }
 
 /// The page of a model with its dataset.
-fn of_dataset(path: &Path, feed: Feed, pictures: Pictures, facts: &Facts) -> Result<Arc<Site>> {
+fn of_dataset(
+    path: &Path,
+    feed: Feed,
+    pictures: Pictures,
+    facts: &ModelFacts,
+) -> Result<Arc<Site>> {
     let (bookmarks, up) = (pictures.bookmarks(), pictures.dataset().up());
     let dataset = pictures.dataset().root.file_name().unwrap_or_default();
     let provenance = Provenance {
@@ -126,7 +131,12 @@ fn of_dataset(path: &Path, feed: Feed, pictures: Pictures, facts: &Facts) -> Res
 }
 
 /// The page of a model alone, which is seen from outside, with -y up.
-fn of_model(path: &Path, feed: Feed, gaussians: &Gaussians, facts: &Facts) -> Result<Arc<Site>> {
+fn of_model(
+    path: &Path,
+    feed: Feed,
+    gaussians: &Gaussians,
+    facts: &ModelFacts,
+) -> Result<Arc<Site>> {
     let bookmark =
         Bookmark { name: "overview".to_owned(), camera: overview(gaussians), pictures: vec![] };
     let provenance = Provenance { facts: *facts, ..Provenance::default() };
@@ -146,7 +156,7 @@ fn page(
     let near = provenance.facts.near.unwrap_or_else(|| RenderSettings::default().near).into();
     let (gaussians, fingerprint, lamp) = (None, None, None);
     let page =
-        Page { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up, lamp };
+        ModelPage { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up, lamp };
     let html = page.html()?;
     Ok(Arc::new(Site { html: html.into(), feed, pictures: pictures.map(Mutex::new) }))
 }

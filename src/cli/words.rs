@@ -14,35 +14,35 @@ use crate::train::{Part, Preset};
 
 /// Parses a `T`, of which some values have names. Others may exist, such as files.
 #[derive(Clone, Debug)]
-pub(super) struct Words<T>(Vec<&'static str>, PhantomData<fn() -> T>);
+pub(super) struct NamedValues<T>(Vec<&'static str>, PhantomData<fn() -> T>);
 
-impl<T> Words<T> {
+impl<T> NamedValues<T> {
     pub(super) fn new(names: impl IntoIterator<Item = &'static str>) -> Self {
         Self(names.into_iter().collect(), PhantomData)
     }
 }
 
 /// The names of all curves.
-pub(super) fn curves<T>() -> Words<T> {
-    Words::new(std::iter::once(Tone::Auto.name()).chain(ToneCurve::ALL.map(ToneCurve::name)))
+pub(super) fn curves<T>() -> NamedValues<T> {
+    NamedValues::new(std::iter::once(Tone::Auto.name()).chain(ToneCurve::ALL.map(ToneCurve::name)))
 }
 
 /// The names of all presets.
-pub(super) fn presets() -> Words<Preset> {
-    Words::new(Preset::ALL.map(Preset::name))
+pub(super) fn presets() -> NamedValues<Preset> {
+    NamedValues::new(Preset::ALL.map(Preset::name))
 }
 
 /// The names of all formats of a model.
-pub(super) fn formats() -> Words<Format> {
-    Words::new(Format::ALL.map(Format::name))
+pub(super) fn formats() -> NamedValues<Format> {
+    NamedValues::new(Format::ALL.map(Format::name))
 }
 
 /// The names of all parts of the model.
-pub(super) fn parts() -> Words<Part> {
-    Words::new(Part::ALL.map(Part::name))
+pub(super) fn parts() -> NamedValues<Part> {
+    NamedValues::new(Part::ALL.map(Part::name))
 }
 
-impl<T> TypedValueParser for Words<T>
+impl<T> TypedValueParser for NamedValues<T>
 where
     T: FromStr<Err: Display> + Clone + Send + Sync + 'static,
 {

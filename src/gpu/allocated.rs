@@ -11,13 +11,13 @@ use gpu_allocator::{AllocationError, MemoryLocation};
 
 use super::lent::{HostAllocation, MemoryFunctions};
 use super::limits::whole_quads;
-use super::{Bound, LastUse, Retired, Shared, lock};
+use super::{Bound, GpuShared, LastUse, Retired, lock};
 use crate::{Error, Result};
 
 /// A Vulkan buffer and its memory.
 #[derive(Debug)]
 pub(super) struct DeviceMemory {
-    pub(super) shared: Arc<Shared>,
+    pub(super) shared: Arc<GpuShared>,
     pub(super) raw: vk::Buffer,
     /// Taken when the buffer retires.
     allocation: Option<Allocation>,
@@ -179,7 +179,7 @@ where
 
 impl DeviceMemory {
     pub(super) fn new(
-        shared: &Arc<Shared>,
+        shared: &Arc<GpuShared>,
         name: &str,
         bytes: u64,
         location: MemoryLocation,
@@ -252,7 +252,7 @@ impl DeviceMemory {
 
 /// Memory within the limit of ours.
 fn allocation(
-    shared: &Shared,
+    shared: &GpuShared,
     name: &str,
     requirements: vk::MemoryRequirements,
     location: MemoryLocation,

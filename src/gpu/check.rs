@@ -149,7 +149,7 @@ pub(super) struct Versions<'a> {
 
 /// The comparison of a buffer's numbers: the largest error in units of its bound, and the first that exceeds it.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct Comparison {
+pub(super) struct BufferComparison {
     pub(super) error: f64,
     /// Index, device, reference, bound.
     pub(super) first: Option<(usize, [f64; 3])>,
@@ -158,11 +158,11 @@ pub(super) struct Comparison {
 
 impl Versions<'_> {
     /// `workgroups` is the number of partial sums.
-    pub(super) fn compare(&self, tolerance: &Tolerance, workgroups: usize) -> Comparison {
+    pub(super) fn compare(&self, tolerance: &Tolerance, workgroups: usize) -> BufferComparison {
         let number = |word: u32| {
             if self.is_float { f64::from(f32::from_bits(word)) } else { f64::from(word) }
         };
-        let mut comparison = Comparison::default();
+        let mut comparison = BufferComparison::default();
         let mut from = 0;
         if let Tolerance::Sum(bound) = *tolerance {
             from = workgroups.min(self.device.len());
@@ -229,7 +229,7 @@ fn flushed(count: usize) -> f64 {
     count as f64 * f64::from(f32::MIN_POSITIVE)
 }
 
-impl Comparison {
+impl BufferComparison {
     fn add(&mut self, index: usize, device: f64, reference: f64, bound: f64) {
         let is_same = device == reference || (device.is_nan() && reference.is_nan());
         let distance = (device - reference).abs();
@@ -247,7 +247,7 @@ impl Comparison {
 
 #[cfg(test)]
 mod tests {
-    use super::{CheckReport, CheckedPass, Comparison, Difference, Tolerance, Versions};
+    use super::{BufferComparison, CheckReport, CheckedPass, Difference, Tolerance, Versions};
 
     #[test]
     fn a_line_counts_the_passes_by_how_they_compare() {
@@ -276,7 +276,7 @@ mod tests {
         assert_eq!(of(&[Some(1.0), Some(2.0), None]), unsound);
     }
 
-    fn compare(device: &[f32], reference: &[f32], tolerance: &Tolerance) -> Comparison {
+    fn compare(device: &[f32], reference: &[f32], tolerance: &Tolerance) -> BufferComparison {
         let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
         let (device, reference) = (bits(device), bits(reference));
         let before = &vec![0; device.len()];
@@ -303,7 +303,7 @@ mod tests {
         assert!(compare(&[1.0 + one], &[1.0], &Tolerance::Roundings(2.0)).first.is_none());
         assert!(compare(&[1.0 + one], &[1.0], &Tolerance::Roundings(1.0)).first.is_some());
         assert!(compare(&[1.0 + one], &[1.0], &Tolerance::Exact).first.is_some());
-        assert_eq!(compare(&[0.0], &[-0.0], &Tolerance::Exact), Comparison::default());
+        assert_eq!(compare(&[0.0], &[-0.0], &Tolerance::Exact), BufferComparison::default());
     }
 
     #[test]
@@ -316,7 +316,7 @@ mod tests {
             Tolerance::Sum(9.0),
         ] {
             let nans = [f32::NAN, -f32::NAN];
-            assert_eq!(compare(&nans, &[f32::NAN; 2], &tolerance), Comparison::default());
+            assert_eq!(compare(&nans, &[f32::NAN; 2], &tolerance), BufferComparison::default());
             let off = compare(&nans, &[1.0, f32::NAN], &tolerance);
             let sums = matches!(tolerance, Tolerance::Sum(_));
             assert_eq!((off.count, off.error), if sums { (0, 0.0) } else { (1, f64::INFINITY) });

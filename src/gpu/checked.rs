@@ -17,8 +17,8 @@ use super::submission::Record;
 #[cfg(feature = "testing")]
 use super::testing;
 use super::{
-    Binding, Bound, CheckReport, CheckedPass, Difference, Download, Gpu, Queue, Recorder, Shared,
-    lock,
+    Binding, Bound, CheckReport, CheckedPass, Difference, Download, Gpu, GpuShared, Queue,
+    Recorder, lock,
 };
 use crate::Result;
 
@@ -92,7 +92,7 @@ impl Drop for CheckedScope<'_> {
     }
 }
 
-impl Shared {
+impl GpuShared {
     /// Records and runs each pass on its own; returns the timeline value of the last. On failure too, the report has
     /// the passes that ran.
     pub(super) fn record_checked(
@@ -113,7 +113,7 @@ impl Shared {
 
 impl Checked<'_> {
     /// Records and runs; returns the timeline value of the last submission.
-    fn run(&mut self, shared: &Arc<Shared>, value: u64, record: Record<'_>) -> Result<u64> {
+    fn run(&mut self, shared: &Arc<GpuShared>, value: u64, record: Record<'_>) -> Result<u64> {
         let mut recorder = Recorder::new(shared, self.pool, value, None)?;
         recorder.observer = Some(self);
         shared.with_uploads(&mut recorder, record)?;

@@ -6,7 +6,7 @@ use ash::{khr, vk};
 
 use super::limits::{MAX_BUFFERS, whole_quads};
 use super::pipeline::Objects;
-use super::{Bound, Retired, Shared};
+use super::{Bound, GpuShared, Retired};
 use crate::Result;
 
 /// How a device takes descriptors.
@@ -17,7 +17,7 @@ pub(super) enum Descriptors {
 
 impl Descriptors {
     /// Pushed where the device was created with the extension, as only then it tells the function's address.
-    pub(super) fn of(instance: &ash::Instance, device: &ash::Device, may_be_pushed: bool) -> Self {
+    pub(super) fn new(instance: &ash::Instance, device: &ash::Device, may_be_pushed: bool) -> Self {
         let name = c"vkCmdPushDescriptorSetKHR".as_ptr();
         // SAFETY: the device is live, the name ends with NUL.
         let function = unsafe { (instance.fp_v1_0().get_device_proc_addr)(device.handle(), name) };
@@ -38,7 +38,7 @@ impl Descriptors {
 /// The sets of one recording; empty where descriptors are pushed.
 #[derive(Debug)]
 pub(super) struct Sets {
-    shared: Arc<Shared>,
+    shared: Arc<GpuShared>,
     pools: Vec<vk::DescriptorPool>,
     /// Sets left in the last pool.
     left: u32,
@@ -48,7 +48,7 @@ pub(super) struct Sets {
 const SETS_OF_A_POOL: u32 = 64;
 
 impl Sets {
-    pub(super) fn new(shared: &Arc<Shared>) -> Self {
+    pub(super) fn new(shared: &Arc<GpuShared>) -> Self {
         Self { shared: Arc::clone(shared), pools: vec![], left: 0 }
     }
 

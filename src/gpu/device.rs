@@ -29,7 +29,7 @@ use super::requirements::required_device_features;
 use super::supported::{OPTIONAL_EXTENSIONS, Supported};
 use super::validation::FIRST_SAFE_WITH_LABELS;
 use super::{
-    DeviceChoice, DeviceReport, Gpu, HostDevice, Properties, Queue, SchedulerVariables, Shared,
+    DeviceChoice, DeviceReport, Gpu, GpuShared, HostDevice, Properties, Queue, SchedulerVariables,
     address_space, reconvergence, statistics, tuning,
 };
 use crate::{Error, Result};
@@ -155,8 +155,8 @@ impl Gpu {
             .has_pipeline_statistics
             .then(|| khr::pipeline_executable_properties::Device::new(instance, &device));
         Ok(Self {
-            shared: Arc::new(Shared {
-                descriptors: Descriptors::of(instance, &device, properties.has_push_descriptors),
+            shared: Arc::new(GpuShared {
+                descriptors: Descriptors::new(instance, &device, properties.has_push_descriptors),
                 properties,
                 labels: debug.clone().filter(|_| has_labels),
                 debug,
@@ -172,7 +172,7 @@ impl Gpu {
                 timeline,
                 last_submission: AtomicU64::new(0),
                 usage: MemoryUsage::default(),
-                budget: BudgetQuery::of(instance, physical),
+                budget: BudgetQuery::new(instance, physical),
                 #[cfg(feature = "testing")]
                 faults,
                 retired: Mutex::new(vec![]),

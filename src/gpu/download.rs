@@ -7,7 +7,7 @@ use gpu_allocator::MemoryLocation;
 
 use super::allocated::DeviceMemory;
 use super::recorder::HOST_SUBMITS;
-use super::{Bound, Gpu, Recorder, Shared, Slice};
+use super::{Bound, Gpu, GpuShared, Recorder, Slice};
 use crate::{Error, Result};
 
 /// A copy of a buffer that a submission brings to the host.
@@ -15,7 +15,7 @@ use crate::{Error, Result};
 pub struct Download<T> {
     /// One copy after the other.
     host: Vec<(DeviceMemory, u64)>,
-    shared: Arc<Shared>,
+    shared: Arc<GpuShared>,
     value: u64,
     element: PhantomData<T>,
 }

@@ -14,7 +14,7 @@ use ash::vk::Handle as _;
 use super::allocated::DeviceMemory;
 use super::lent::{HostDevice, HostFrame, QueueLock};
 use super::recorder::Recorder;
-use super::{Bound, Gpu, Shared, lock};
+use super::{Bound, Gpu, GpuShared, lock};
 use crate::{Error, Result};
 
 /// What we know of the host of a lent device.
@@ -105,7 +105,7 @@ impl Host {
     }
 }
 
-impl Shared {
+impl GpuShared {
     /// The number of the last frame that was recorded; 0 without a host.
     pub(super) fn last_frame(&self) -> u64 {
         self.host.as_ref().map_or(0, |host| host.last_frame.load(Ordering::Acquire))

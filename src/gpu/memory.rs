@@ -33,7 +33,7 @@ pub(super) struct BudgetQuery {
 
 impl BudgetQuery {
     /// `None` where the device does not support the extension.
-    pub(super) fn of(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Self> {
+    pub(super) fn new(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Self> {
         // SAFETY: the handle was enumerated from the instance.
         let extensions = unsafe { instance.enumerate_device_extension_properties(physical) };
         let is_offered = |extension: &vk::ExtensionProperties| {

@@ -6,7 +6,7 @@ use ash::vk;
 use gpu_allocator::MemoryLocation;
 
 use super::allocated::DeviceMemory;
-use super::{Bound, Shared};
+use super::{Bound, GpuShared};
 use crate::Result;
 
 /// One Vulkan buffer after the other, addressed as if they were one.
@@ -19,7 +19,12 @@ pub(super) struct Parts {
 
 impl Parts {
     /// `bytes` of device memory; no window of `window` bytes from a multiple of that on is divided.
-    pub(super) fn new(shared: &Arc<Shared>, name: &str, bytes: u64, window: u64) -> Result<Self> {
+    pub(super) fn new(
+        shared: &Arc<GpuShared>,
+        name: &str,
+        bytes: u64,
+        window: u64,
+    ) -> Result<Self> {
         let most = shared.properties.max_buffer_size;
         let part =
             if bytes <= most { u64::MAX } else { (most / window.max(1)).max(1) * window.max(1) };
@@ -37,7 +42,7 @@ impl Parts {
     }
 
     #[cfg(feature = "capi")]
-    pub(super) fn is_on(&self, shared: &Arc<Shared>) -> bool {
+    pub(super) fn is_on(&self, shared: &Arc<GpuShared>) -> bool {
         self.parts.iter().all(|part| Arc::ptr_eq(&part.shared, shared))
     }
 

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use ash::vk;
 
 use super::{
-    Gpu, Interface, Kernel, Properties, Retired, Shared, Statistic, reconvergence, spirv,
+    Gpu, GpuShared, Interface, Kernel, Properties, Retired, Statistic, reconvergence, spirv,
     statistics,
 };
 use crate::{Error, Result};
@@ -26,7 +26,7 @@ pub(super) struct Objects {
     pub(super) raw: vk::Pipeline,
     pub(super) layout: vk::PipelineLayout,
     pub(super) set_layout: vk::DescriptorSetLayout,
-    pub(super) shared: Arc<Shared>,
+    pub(super) shared: Arc<GpuShared>,
 }
 
 impl Gpu {
@@ -111,7 +111,7 @@ impl<K: Kernel> Pipeline<K> {
 }
 
 /// The error for a kernel that the driver does not compile.
-fn refused(shared: &Shared, kernel: &str, result: vk::Result) -> Error {
+fn refused(shared: &GpuShared, kernel: &str, result: vk::Result) -> Error {
     let is_memory = [
         vk::Result::ERROR_OUT_OF_HOST_MEMORY,
         vk::Result::ERROR_OUT_OF_DEVICE_MEMORY,
@@ -138,7 +138,7 @@ fn described(interface: &Interface, constants: &[(u32, u32)]) -> String {
 /// # Safety
 /// The device is live.
 unsafe fn set_layout(
-    shared: &Shared,
+    shared: &GpuShared,
     interface: &Interface,
 ) -> Result<vk::DescriptorSetLayout, vk::Result> {
     let bindings: Vec<_> = interface
@@ -162,7 +162,7 @@ unsafe fn set_layout(
 /// # Safety
 /// The device and the set layout are live.
 unsafe fn pipeline_layout(
-    shared: &Shared,
+    shared: &GpuShared,
     interface: &Interface,
     set_layout: vk::DescriptorSetLayout,
 ) -> Result<vk::PipelineLayout, vk::Result> {
@@ -181,7 +181,7 @@ unsafe fn pipeline_layout(
 /// # Safety
 /// The device and the layout are live.
 unsafe fn raw_pipeline(
-    shared: &Shared,
+    shared: &GpuShared,
     interface: &Interface,
     layout: vk::PipelineLayout,
     mut constants: Vec<(u32, u32)>,
@@ -239,7 +239,7 @@ unsafe fn raw_pipeline(
     }
 }
 
-impl Shared {
+impl GpuShared {
     /// Names an object for captures and validation messages.
     fn name<H: vk::Handle>(&self, object: H, name: &str) {
         let (Some(debug), Ok(name)) = (&self.debug, std::ffi::CString::new(name)) else { return };

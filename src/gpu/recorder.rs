@@ -14,7 +14,7 @@ use super::descriptors::Sets;
 use super::limits::whole_quads;
 use super::pipeline::Objects;
 use super::{
-    Binding, Bound, Buffer, HostFrame, Interface, Pipeline, Properties, Recordable, Shared,
+    Binding, Bound, Buffer, GpuShared, HostFrame, Interface, Pipeline, Properties, Recordable,
 };
 use crate::{Error, Result};
 
@@ -31,7 +31,7 @@ pub enum Threads {
 /// A command buffer being filled. Passes run in order; each sees the results of those before it.
 #[derive(Debug)]
 pub struct Recorder<'g> {
-    shared: &'g Arc<Shared>,
+    shared: &'g Arc<GpuShared>,
     /// What its passes bind.
     sets: Sets,
     pub(super) commands: vk::CommandBuffer,
@@ -106,7 +106,7 @@ const MAX_UPDATE: usize = 65_536;
 impl<'g> Recorder<'g> {
     /// Starts with a barrier after everything submitted before; the host reads once it is done.
     pub(super) fn new(
-        shared: &'g Arc<Shared>,
+        shared: &'g Arc<GpuShared>,
         pool: vk::CommandPool,
         value: u64,
         timestamps: Option<Timestamps>,
@@ -125,7 +125,7 @@ impl<'g> Recorder<'g> {
 
     /// Starts with a barrier after everything before it in the host's queue, and ends with one for what the host's own
     /// commands read.
-    pub(super) fn for_host(shared: &'g Arc<Shared>, frame: &HostFrame) -> Self {
+    pub(super) fn for_host(shared: &'g Arc<GpuShared>, frame: &HostFrame) -> Self {
         let commands = vk::CommandBuffer::from_raw(frame.commands);
         let readers = vk::PipelineStageFlags2::from_raw(frame.readers);
         let mut recorder = Self::unstarted(shared, commands, readers);
@@ -134,7 +134,7 @@ impl<'g> Recorder<'g> {
     }
 
     fn unstarted(
-        shared: &'g Arc<Shared>,
+        shared: &'g Arc<GpuShared>,
         commands: vk::CommandBuffer,
         readers: vk::PipelineStageFlags2,
     ) -> Self {
@@ -170,7 +170,7 @@ impl<'g> Recorder<'g> {
         Ok(())
     }
 
-    pub(super) fn shared(&self) -> &'g Arc<Shared> {
+    pub(super) fn shared(&self) -> &'g Arc<GpuShared> {
         self.shared
     }
 

@@ -14,13 +14,13 @@ const SLOTS: usize = 4;
 pub(crate) struct Ring {
     memory: DeviceMemory,
     words: usize,
-    slots: [Option<Slot>; SLOTS],
+    slots: [Option<RingSlot>; SLOTS],
     next: usize,
 }
 
 /// The recording of a slot's words.
 #[derive(Clone, Copy, Debug)]
-struct Slot {
+struct RingSlot {
     recording: LastUse,
     /// The order of recording.
     number: u64,
@@ -45,34 +45,34 @@ impl Recorder<'_> {
         self.copy_raw(buffer.bound(), target, size);
         self.leave_for_host();
         let recording = LastUse { submission: self.value(), frame: self.shared().last_frame() };
-        ring.slots[index] = Some(Slot { recording, number: ring.next as u64, tag });
+        ring.slots[index] = Some(RingSlot { recording, number: ring.next as u64, tag });
         ring.next += 1;
     }
 }
 
 impl Ring {
     /// The words of the newest recording that is done.
-    pub(crate) fn newest(&self) -> Option<Newest> {
+    pub(crate) fn newest(&self) -> Option<RingEntry> {
         let shared = &self.memory.shared;
         let done = LastUse { submission: shared.reached(), frame: shared.frames_reached() };
-        let is_done = |slot: &Slot| {
+        let is_done = |slot: &RingSlot| {
             slot.recording.submission <= done.submission && slot.recording.frame <= done.frame
         };
         let slots = self.slots.iter().enumerate();
-        let known = slots.filter_map(|(index, slot)| Some((index, (*slot)?)));
+        let used = slots.filter_map(|(index, slot)| Some((index, (*slot)?)));
         let (index, slot) =
-            known.filter(|(_, slot)| is_done(slot)).max_by_key(|(_, slot)| slot.number)?;
+            used.filter(|(_, slot)| is_done(slot)).max_by_key(|(_, slot)| slot.number)?;
         let bytes = self.words * size_of::<u32>();
         let mapped = self.memory.mapped()?.get(index * bytes..)?.get(..bytes)?;
         let mut words = vec![0u32; self.words];
         bytemuck::cast_slice_mut(&mut words).copy_from_slice(mapped);
-        Some(Newest { frame: slot.recording.frame, number: slot.number, tag: slot.tag, words })
+        Some(RingEntry { frame: slot.recording.frame, number: slot.number, tag: slot.tag, words })
     }
 }
 
 /// What [`Ring::newest`] finds.
 #[derive(Debug)]
-pub(crate) struct Newest {
+pub(crate) struct RingEntry {
     /// The number of its frame.
     pub(crate) frame: u64,
     /// Its place in the order of recording.

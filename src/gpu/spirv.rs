@@ -48,7 +48,7 @@ fn put(code: &mut Vec<u32>, opcode: u32, operands: &[u32]) {
 /// The module with its specialization constants as plain ones: those of `values`, which are ids and bits, and their
 /// defaults. The workgroup size is that of the execution mode.
 pub(super) fn frozen(code: &[u32], values: &[(u32, u32)]) -> Vec<u32> {
-    let constants = Constants::of(code, values);
+    let constants = Constants::new(code, values);
     let mut frozen = code[..HEADER.min(code.len())].to_vec();
     for (opcode, instruction) in instructions(code) {
         let operands = &instruction[1..];
@@ -92,7 +92,7 @@ struct Constants {
 }
 
 impl Constants {
-    fn of(code: &[u32], values: &[(u32, u32)]) -> Self {
+    fn new(code: &[u32], values: &[(u32, u32)]) -> Self {
         let values: BTreeMap<u32, u32> = values.iter().copied().collect();
         let (mut all, mut specialised) = (Self::default(), BTreeMap::new());
         for (opcode, instruction) in instructions(code) {

@@ -53,7 +53,7 @@ impl Resources {
     /// The names are, in this order: RADV's, NVK's, ANV's, Turnip's, NVIDIA's, AMD's own driver's; without regard to
     /// case. What a driver tells in several numbers is added up.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn of(statistics: &[Statistic]) -> Self {
+    pub(crate) fn from_statistics(statistics: &[Statistic]) -> Self {
         let sum = |names: &[&str]| {
             let is_meant =
                 |told: &&Statistic| names.iter().any(|name| told.name.eq_ignore_ascii_case(name));
@@ -139,7 +139,7 @@ fn line(
         "constants": named.trim_end_matches('}').trim(),
     });
     if let (Some(line), Value::Object(resources)) =
-        (line.as_object_mut(), json!(Resources::of(statistics)))
+        (line.as_object_mut(), json!(Resources::from_statistics(statistics)))
     {
         line.extend(resources);
     }
@@ -227,13 +227,13 @@ mod tests {
             Resources { registers, spills, scratch, shared, instructions }
         };
         assert_eq!(
-            Resources::of(&told(&radv)),
+            Resources::from_statistics(&told(&radv)),
             resources([80.0, 3.0, 64.0, 512.0, 869.0].map(Some))
         );
         let expected = resources([Some(138.0), None, Some(0.0), None, Some(1233.0)]);
-        assert_eq!(Resources::of(&told(&nvk)), expected);
+        assert_eq!(Resources::from_statistics(&told(&nvk)), expected);
         assert_eq!(
-            Resources::of(&told(&anv)),
+            Resources::from_statistics(&told(&anv)),
             resources([84.0, 7.0, 1024.0, 256.0, 862.0].map(Some))
         );
         let nvidia = [
@@ -242,13 +242,14 @@ mod tests {
             ("Shared Memory Size", 0.0),
         ];
         let expected = resources([Some(44.0), None, Some(16.0), Some(0.0), None]);
-        assert_eq!(Resources::of(&told(&nvidia)), expected);
-        assert_eq!(Resources::of(&[]), Resources::default());
+        assert_eq!(Resources::from_statistics(&told(&nvidia)), expected);
+        assert_eq!(Resources::from_statistics(&[]), Resources::default());
     }
 
     #[test]
     fn a_kernel_spills_if_the_driver_moves_registers_or_takes_scratch() {
-        let spills = |statistics: &[(&str, f64)]| Resources::of(&told(statistics)).spill();
+        let spills =
+            |statistics: &[(&str, f64)]| Resources::from_statistics(&told(statistics)).spill();
         assert!(spills(&[("Spilled VGPRs", 1.0)]) && spills(&[("SLM Size", 4.0)]));
         assert!(!spills(&[("Spilled VGPRs", 0.0), ("VGPRs", 256.0)]) && !spills(&[]));
     }

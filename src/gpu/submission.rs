@@ -7,7 +7,7 @@ use std::thread;
 use ash::vk;
 
 use super::recorder::{MAX_TIMESTAMPS, Timestamps};
-use super::{Gpu, Queue, Recorder, Retired, Shared, lock};
+use super::{Gpu, GpuShared, Queue, Recorder, Retired, lock};
 use crate::{Error, Result};
 
 /// A closure that records into a command buffer.
@@ -16,7 +16,7 @@ pub(super) type Record<'a> = Box<dyn FnOnce(&mut Recorder<'_>) -> Result<()> + '
 /// Work in flight.
 #[derive(Debug)]
 pub struct Submission {
-    shared: Arc<Shared>,
+    shared: Arc<GpuShared>,
     value: u64,
 }
 
@@ -41,11 +41,11 @@ impl Submission {
 
 /// The queue, held by the thread that records.
 struct Recording<'a> {
-    shared: &'a Shared,
+    shared: &'a GpuShared,
     queue: MutexGuard<'a, Queue>,
 }
 
-impl Shared {
+impl GpuShared {
     pub(super) fn refuse_nested(&self, label: &str) -> Result<()> {
         match lock(&self.progress).recorded_here() {
             Some(outer) => Err(Error::Usage(format!(
@@ -238,7 +238,7 @@ impl Gpu {
     }
 }
 
-impl Shared {
+impl GpuShared {
     /// A command buffer that is being recorded.
     pub(super) fn begin(&self, pool: vk::CommandPool) -> Result<vk::CommandBuffer> {
         let fail = |call| move |result| self.error(call, result);

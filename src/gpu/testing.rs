@@ -10,7 +10,7 @@ use std::sync::{Arc, OnceLock};
 use ash::vk;
 
 pub use super::faults::Faults;
-use super::{DeviceChoice, Gpu, Interface, Properties, Shared};
+use super::{DeviceChoice, Gpu, GpuShared, Interface, Properties};
 
 static GPU: OnceLock<Gpu> = OnceLock::new();
 
@@ -85,7 +85,7 @@ pub fn frozen(
 }
 
 #[expect(clippy::panic, reason = "a test without a device must fail")]
-fn open(adapt: impl FnOnce(&mut Shared)) -> Gpu {
+fn open(adapt: impl FnOnce(&mut GpuShared)) -> Gpu {
     super::validation::fail_at_exit();
     let choice = std::env::var("NIGHTSPLAT_DEVICE").unwrap_or_default();
     let choice: DeviceChoice = choice.parse().unwrap_or_else(|error| panic!("{error}"));

@@ -81,13 +81,13 @@ pub struct DepthLoss {
 
 /// How the regions of a view are split into chunks.
 #[derive(Clone, Copy)]
-struct Chunks {
+struct DepthChunks {
     boxes: DepthBoxes,
     of_view: u32,
     of_box: u32,
 }
 
-impl Chunks {
+impl DepthChunks {
     fn total(self) -> u32 {
         self.of_view.saturating_add(self.boxes.count.saturating_mul(self.of_box))
     }
@@ -146,7 +146,7 @@ impl DepthLoss {
         pass: &mut Recorder<'_>,
         inputs: &TermInputs<'_>,
         depth: &Buffer<f32>,
-        chunks: Chunks,
+        chunks: DepthChunks,
     ) -> Result<()> {
         let &TermInputs { size, render, .. } = inputs;
         let (width, first) = (size.x, inputs.plane(Feature::Depth) * pixel_count(size));
@@ -195,9 +195,9 @@ impl DepthLoss {
         )
     }
 
-    fn chunks(&self, size: UVec2) -> Chunks {
+    fn chunks(&self, size: UVec2) -> DepthChunks {
         let boxes = DepthBoxes::new(size, self.box_side);
-        Chunks {
+        DepthChunks {
             boxes,
             of_view: pixel_count(size).div_ceil(self.chunk_size),
             of_box: (boxes.side * boxes.side).div_ceil(self.chunk_size),

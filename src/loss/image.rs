@@ -8,7 +8,7 @@ mod ssim;
 
 use glam::UVec2;
 
-use ssim::Ssim;
+use ssim::SsimLoss;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
@@ -66,21 +66,21 @@ pub struct LossInputs<'a> {
 pub struct Loss {
     gpu: Gpu,
     terms: [Term; 2],
-    kernels: Kernels,
+    kernels: ImageKernels,
     max_values: u32,
     l1_partials: Buffer<f32>,
     ssim_partials: Buffer<f32>,
 }
 
 #[derive(Debug)]
-enum Kernels {
+enum ImageKernels {
     /// The SSIM weight is zero: SSIM is not evaluated.
     L1 {
         whole: Pipeline<l1::Kernel>,
         loss_region: Pipeline<l1::Kernel>,
         values_per_workgroup: u32,
     },
-    Ssim(Ssim),
+    Ssim(SsimLoss),
 }
 
 impl Loss {
@@ -95,10 +95,10 @@ impl Loss {
         }
         let subgroup_size = gpu.properties().subgroup_size;
         let kernels = if ssim_weight > 0.0 {
-            Kernels::Ssim(Ssim::new(gpu, ssim_weight, adds)?)
+            ImageKernels::Ssim(SsimLoss::new(gpu, ssim_weight, adds)?)
         } else {
             let constants = l1::Constants { adds, ..Default::default() };
-            Kernels::L1 {
+            ImageKernels::L1 {
                 whole: gpu.pipeline(&constants)?,
                 loss_region: gpu
                     .pipeline(&l1::Constants { with_loss_region: true, ..constants })?,
@@ -122,8 +122,8 @@ impl Loss {
         self.l1_partials.grow(&self.gpu, workgroups)?;
         self.ssim_partials.grow(&self.gpu, workgroups)?;
         match &mut self.kernels {
-            Kernels::Ssim(ssim) => ssim.reserve(&self.gpu, self.max_values),
-            Kernels::L1 { .. } => Ok(()),
+            ImageKernels::Ssim(ssim) => ssim.reserve(&self.gpu, self.max_values),
+            ImageKernels::L1 { .. } => Ok(()),
         }
     }
 
@@ -141,7 +141,7 @@ impl Loss {
         let [l1_partials, ssim_partials] = [&mut self.l1_partials, &mut self.ssim_partials];
         let mut ssim_count = 0;
         match &mut self.kernels {
-            Kernels::L1 { whole, loss_region, .. } => {
+            ImageKernels::L1 { whole, loss_region, .. } => {
                 let LossInputs { size, render, target, .. } = inputs;
                 let is_whole = inputs.loss_region == LossRegion::whole(size);
                 pass.dispatch(
@@ -163,7 +163,7 @@ impl Loss {
                     Threads::Workgroups([workgroups, 1, 1]),
                 )?;
             }
-            Kernels::Ssim(ssim) => {
+            ImageKernels::Ssim(ssim) => {
                 ssim_count = workgroups;
                 let partials = [l1_partials, ssim_partials];
                 if ssim.record(pass, inputs, d_render, partials, self.terms, log)? {
@@ -203,7 +203,7 @@ impl Loss {
     }
 }
 
-impl Kernels {
+impl ImageKernels {
     /// One subgroup per workgroup; one workgroup per partial sum.
     fn workgroups(&self, size: UVec2) -> u32 {
         match self {

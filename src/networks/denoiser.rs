@@ -21,7 +21,7 @@ use super::conv::{AccumulateInto, Activation, Backward, Conv, Layer, Precision, 
 use super::half::{Direction, PackedMap};
 use super::inner::{Inner, InnerLayer, PackedBackward};
 use super::norm::{Forward, Norm, NormUse};
-use super::parameters::{Layout, Parameters};
+use super::parameters::{ParameterLayout, Parameters};
 use super::relu::ReluBackward;
 use super::reserved::Reserved;
 use super::{NetworkVariant, RGB};
@@ -89,15 +89,15 @@ pub struct Denoiser {
     /// The settings with the precision that the device supports.
     held: DenoiserSettings,
     parameters: Parameters,
-    stages: Vec<Stage>,
-    kernels: Kernels,
+    stages: Vec<DenoiserStage>,
+    kernels: DenoiserKernels,
     reserved: Reserved<DenoiserMemory>,
     earlier: EarlierStages,
 }
 
 /// The offsets of a stage's layers in the parameters.
 #[derive(Clone, Copy, Debug)]
-struct Stage {
+struct DenoiserStage {
     number: usize,
     conv_in: u32,
     conv: u32,
@@ -106,7 +106,7 @@ struct Stage {
 }
 
 #[derive(Debug)]
-struct Kernels {
+struct DenoiserKernels {
     channels: u32,
     repeats: usize,
     conv_in: Conv,
@@ -125,9 +125,9 @@ impl Denoiser {
     /// Draws the weights; [`Denoiser::reserve`] allocates for views.
     pub fn new(gpu: &Gpu, settings: DenoiserSettings, seed: u64) -> Result<Self> {
         settings.check()?;
-        let mut layout = Layout::new(Stream::new(seed, STREAM));
+        let mut layout = ParameterLayout::new(Stream::new(seed, STREAM));
         let channels = settings.channels;
-        let stage = |k| Stage {
+        let stage = |k| DenoiserStage {
             number: k as usize,
             conv_in: layout.conv(&format!("{k}.conv_in"), RGB, channels),
             conv: layout.conv(&format!("{k}.conv"), channels, channels),
@@ -147,7 +147,7 @@ impl Denoiser {
                 serde_json::json!(settings).to_string(),
             )?,
             stages,
-            kernels: Kernels::new(gpu, settings)?,
+            kernels: DenoiserKernels::new(gpu, settings)?,
             reserved: Reserved::new("denoiser", |extent| DenoiserMemory::new(gpu, held, extent))?,
             earlier: EarlierStages::default(),
         })
@@ -250,7 +250,7 @@ impl Denoiser {
         for (k, stage) in self.stages.iter().enumerate() {
             let (before, from_here) = denoised.split_at_mut(k);
             let stage_input = before.last().unwrap_or(input);
-            let activations = earlier.of(k, extent, shared);
+            let activations = earlier.activations(k, extent, shared);
             kernels.conv.prepare(pass, Direction::Forward, stage.inner(&parameters.values))?;
             let values = &parameters.values;
             kernels.stage_forward(pass, size, stage, values, stage_input, activations)?;
@@ -296,7 +296,7 @@ impl Denoiser {
         let last = stages.len() - 1;
         for (k, stage) in stages.iter().enumerate().rev() {
             let stage_input = if k == 0 { input } else { &memory.denoised[k - 1] };
-            let activations = earlier.of(k, extent, &mut memory.activations);
+            let activations = earlier.activations(k, extent, &mut memory.activations);
             if k < last && !are_kept {
                 let values = &parameters.values;
                 kernels.stage_forward(pass, size, stage, values, stage_input, activations)?;
@@ -351,7 +351,7 @@ struct StageMaps<'a> {
     d_stage_input: &'a mut Buffer<f32>,
 }
 
-impl Kernels {
+impl DenoiserKernels {
     fn new(gpu: &Gpu, settings: DenoiserSettings) -> Result<Self> {
         let DenoiserSettings { channels, precision, variant, .. } = settings;
         let Properties { name, cooperative_matrix, .. } = gpu.properties();
@@ -379,7 +379,7 @@ impl Kernels {
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
-        stage: &Stage,
+        stage: &DenoiserStage,
         values: &Buffer<f32>,
         input: &Buffer<f32>,
         activations: &mut Activations,
@@ -401,7 +401,7 @@ impl Kernels {
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
-        stage: &Stage,
+        stage: &DenoiserStage,
         parameters: &mut Parameters,
         maps: Maps<'_>,
         ends: StageMaps<'_>,
@@ -439,7 +439,7 @@ impl Kernels {
     }
 }
 
-impl Stage {
+impl DenoiserStage {
     /// The repeated layer.
     fn inner(self, values: &Buffer<f32>) -> InnerLayer<'_> {
         InnerLayer { number: self.number, layer: Layer { offset: self.conv, values } }

@@ -24,7 +24,7 @@ pub(crate) struct TensorFile<'a> {
 }
 
 impl<'a> TensorFile<'a> {
-    pub(crate) fn of(bytes: &'a [u8]) -> std::result::Result<Self, SafeTensorError> {
+    pub(crate) fn parse(bytes: &'a [u8]) -> std::result::Result<Self, SafeTensorError> {
         let (header_bytes, metadata) = SafeTensors::read_metadata(bytes)?;
         // The length of the header precedes it.
         Ok(Self { metadata, data: &bytes[size_of::<u64>() + header_bytes..] })
@@ -102,7 +102,7 @@ pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<
     let bytes = input::bytes(path)?;
     let damaged =
         |error| Error::input(path, format!("is not an intact safetensors file ({error})"));
-    let file = TensorFile::of(&bytes).map_err(damaged)?;
+    let file = TensorFile::parse(&bytes).map_err(damaged)?;
     let settings = file.note(SETTINGS);
     let settings: Value = settings.and_then(|s| serde_json::from_str(s).ok()).unwrap_or_default();
 
@@ -130,11 +130,11 @@ pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<
                 format!("tensor `{name}` holds values that are not finite; save it again");
             Err(Error::input(path, problem))
         };
-        let known: BTreeSet<String> =
+        let expected_names: BTreeSet<String> =
             parameters.tensors().iter().map(|tensor| format!("{prefix}.{}", tensor.name)).collect();
         let is_stray = |name: &&str| {
             let is_own = name.strip_prefix(prefix).is_some_and(|rest| rest.starts_with('.'));
-            is_own && !known.contains(*name)
+            is_own && !expected_names.contains(*name)
         };
         values.push(parameters.tensors().iter().map(read).collect::<Result<Vec<_>>>()?.concat());
         let names = file.metadata.tensors();

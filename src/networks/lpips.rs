@@ -47,14 +47,14 @@ impl Range {
 
 /// A version of LPIPS: values of different versions are not comparable.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Measure {
+pub struct LpipsVersion {
     /// The network.
     pub network: Network,
     /// The input range.
     pub range: Range,
 }
 
-impl Measure {
+impl LpipsVersion {
     /// All versions.
     pub fn all() -> impl Iterator<Item = Self> {
         let of = |network| Range::ALL.map(|range| Self { network, range });
@@ -93,10 +93,10 @@ impl Lpips {
     pub fn load(gpu: &Gpu, path: impl AsRef<Path>, range: Range) -> Result<Self> {
         let path = path.as_ref();
         let bytes = input::bytes(path)?;
-        let file = TensorFile::of(&bytes).map_err(|error| {
+        let file = TensorFile::parse(&bytes).map_err(|error| {
             Error::input(path, format!("is not an intact safetensors file ({error})"))
         })?;
-        let network = Network::of(path, &file)?;
+        let network = Network::detect(path, &file)?;
         let trunk = Trunk::new(gpu, path, &file, network)?;
         let weights = network.compared_channels().enumerate().map(|(index, channels)| {
             published(path, &file, &format!("lin{index}.model.1.weight"), &[1, channels, 1, 1])
@@ -105,8 +105,8 @@ impl Lpips {
     }
 
     /// The version of its distances.
-    pub fn measure(&self) -> Measure {
-        Measure { network: self.trunk.network, range: self.range }
+    pub fn measure(&self) -> LpipsVersion {
+        LpipsVersion { network: self.trunk.network, range: self.range }
     }
 
     /// The distance between two images of one size, sRGB in [0, 1]; 0 for equal ones.

@@ -74,13 +74,13 @@ impl Learnable for Parameters {
 
 /// Lays out the tensors of a network and draws their initial values.
 #[derive(Debug)]
-pub(super) struct Layout {
+pub(super) struct ParameterLayout {
     random: Stream,
     tensors: Vec<Tensor>,
     values: Vec<f32>,
 }
 
-impl Layout {
+impl ParameterLayout {
     pub(super) fn new(random: Stream) -> Self {
         Self { random, tensors: vec![], values: vec![] }
     }
@@ -97,7 +97,7 @@ impl Layout {
         offset
     }
 
-    /// The last layer, to RGB: [`Layout::conv`], or zeros in the identity variant, which still learn.
+    /// The last layer, to RGB: [`ParameterLayout::conv`], or zeros in the identity variant, which still learn.
     pub(super) fn last_conv(&mut self, name: &str, inputs: u32, variant: NetworkVariant) -> u32 {
         if variant == NetworkVariant::Paper {
             return self.conv(name, inputs, RGB);

@@ -5,7 +5,7 @@ use glam::UVec2;
 use super::conv::{
     AccumulateInto, Activation, Backward, Conv, Layer, Precision, Strips, partial_count,
 };
-use super::parameters::{Layout, Parameters};
+use super::parameters::{ParameterLayout, Parameters};
 use super::relu::ReluBackward;
 use super::reserved::{Extent, Reserved};
 use super::{NetworkVariant, RGB, check_binding};
@@ -57,7 +57,7 @@ impl Tonemapper {
 
     /// Draws the weights; [`Tonemapper::reserve`] allocates for views.
     pub fn new(gpu: &Gpu, variant: NetworkVariant, seed: u64) -> Result<Self> {
-        let mut layout = Layout::new(Stream::new(seed, STREAM));
+        let mut layout = ParameterLayout::new(Stream::new(seed, STREAM));
         let offsets = [
             layout.conv("conv1", RGB, CHANNELS),
             layout.conv("conv2", CHANNELS, CHANNELS),

@@ -131,7 +131,7 @@ impl Network {
     }
 
     /// The network of a file, by its last convolution.
-    pub(crate) fn of(path: &Path, file: &TensorFile<'_>) -> Result<Self> {
+    pub(crate) fn detect(path: &Path, file: &TensorFile<'_>) -> Result<Self> {
         let is_held = |network: &Self| file.tensor(&network.last_tensor()).is_some();
         Self::ALL.into_iter().find(is_held).ok_or_else(|| {
             let wanted = Self::ALL

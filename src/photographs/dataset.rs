@@ -11,6 +11,7 @@ mod colmap;
 mod dark_references;
 mod depth;
 pub(crate) mod exclude;
+mod extent;
 mod fingerprint;
 mod layout;
 mod listing;
@@ -23,7 +24,6 @@ mod options;
 mod original;
 mod packed;
 mod pixels;
-mod place;
 mod ply;
 mod points;
 mod prepare;
@@ -47,20 +47,20 @@ use glam::DVec3;
 
 use crate::camera::Lens;
 use crate::photographs::image::MaskFile;
-use crate::photographs::image::files::Files;
+use crate::photographs::image::files::PhotographFiles;
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 pub(crate) use borders::Borders;
 pub use fingerprint::Fingerprint;
-use layout::Layout;
-use listing::{ListedView, Listing, select, warn};
+use layout::DatasetLayout;
+use listing::{Listing, ViewEntry, select, warn};
 pub(crate) use masks::is_beside as is_mask;
 use members::with_held_out;
 pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
 pub use original::Original;
-pub(crate) use pixels::Look;
+pub(crate) use pixels::PhotographObserver;
 use points::points;
-use source::Source;
+use source::ViewFiles;
 use split::{TEST_EVERY, log_split};
 pub use turns::PixelOrientation;
 pub use view::{Split, View};
@@ -135,25 +135,25 @@ impl Dataset {
     /// # Ok::<(), nightsplat::Error>(())
     /// ```
     pub fn load(root: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
-        Self::load_and_look(root.as_ref(), options, None)
+        Self::load_observed(root.as_ref(), options, None)
     }
 
-    /// As [`Dataset::load`]; `look` is called with every training photograph as stored while it is in memory.
-    pub(crate) fn load_and_look(
+    /// As [`Dataset::load`]; `observer` is called with every training photograph as stored while it is in memory.
+    pub(crate) fn load_observed(
         root: &Path,
         options: &LoadOptions,
-        look: Option<Look<'_>>,
+        observer: Option<PhotographObserver<'_>>,
     ) -> Result<Self> {
         let _phase = tracing::info_span!("decoding").entered();
         options.check()?;
-        let files = Files::default();
-        let layout = Layout::of(root)?;
+        let files = PhotographFiles::default();
+        let layout = DatasetLayout::detect(root)?;
         let Listing { frames, mut skipped, remarks, clouds, has_split } =
             select(&layout, options, &files)?;
         log_split(&layout.root, has_split, options);
         let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
         let gains = white_balance_gains(&layout.root, &sources, options)?;
-        let views = pixels::load(sources, &layout, options, look, gains, &mut skipped)?;
+        let views = pixels::load(sources, &layout, options, observer, gains, &mut skipped)?;
         if !views.iter().any(|view| view.split == Split::Train) {
             let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
             let problem = format!(
@@ -187,8 +187,8 @@ impl Dataset {
 
     /// The rule that selects the held-out views, in words.
     pub(crate) fn split_rule(root: &Path, options: &LoadOptions) -> String {
-        let layout = Layout::of(root).ok();
-        let listings = layout.as_ref().map(Layout::listings).unwrap_or_default();
+        let layout = DatasetLayout::detect(root).ok();
+        let listings = layout.as_ref().map(DatasetLayout::listings).unwrap_or_default();
         let has_test = listings.iter().any(|(_, split)| *split == Some(Split::Test));
         let root = layout.as_ref().map_or(root, |layout| &layout.root);
         match options.test_every {
@@ -202,7 +202,7 @@ impl Dataset {
 
     /// Whether `root` is a folder in which [`Dataset::load`] finds cameras.
     pub(crate) fn is_at(root: &Path) -> bool {
-        Layout::of(root).is_ok_and(|layout| layout.has_listing())
+        DatasetLayout::detect(root).is_ok_and(|layout| layout.has_listing())
     }
 
     /// Of the models that COLMAP wrote into the subfolders of `folder`, the one with the most registered photographs of
@@ -236,7 +236,7 @@ impl Dataset {
     /// The folder with the contents of an archive: its only folder, if there is nothing else.
     #[cfg(feature = "cli")]
     pub(crate) fn folder_of(archive: &Path) -> Result<PathBuf> {
-        Ok(Layout::of(archive)?.root)
+        Ok(DatasetLayout::detect(archive)?.root)
     }
 
     /// The files of the views below `root`, sorted by name, without decoding any.
@@ -255,12 +255,12 @@ impl Dataset {
         options: &LoadOptions,
     ) -> Result<(Vec<Photograph>, Vec<String>, Vec<String>)> {
         options.check()?;
-        let files = Files::default();
-        let layout = Layout::of(root)?;
+        let files = PhotographFiles::default();
+        let layout = DatasetLayout::detect(root)?;
         let Listing { frames, mut skipped, remarks, .. } = select(&layout, options, &files)?;
         let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
-        let photograph = |source: Source| {
-            let Source { name, split, input, reference, mask, .. } = source;
+        let photograph = |source: ViewFiles| {
+            let ViewFiles { name, split, input, reference, mask, .. } = source;
             Some(Photograph { name, split, input: input?, reference, mask })
         };
         Ok((sources.into_iter().filter_map(photograph).collect(), skipped, remarks))
@@ -270,7 +270,7 @@ impl Dataset {
 /// The gains of the photographs; `None` without a white balance.
 fn white_balance_gains(
     root: &Path,
-    sources: &[Source],
+    sources: &[ViewFiles],
     options: &LoadOptions,
 ) -> Result<Option<WhiteBalanceGains>> {
     let photographs = || {
@@ -282,13 +282,13 @@ fn white_balance_gains(
 /// The files of each view. A training view without its photograph is left out, a test view is kept as a pose.
 fn sources(
     root: &Path,
-    frames: &[ListedView],
+    frames: &[ViewEntry],
     options: &LoadOptions,
-    files: &Files,
+    files: &PhotographFiles,
     skipped: &mut Vec<String>,
-) -> Vec<Source> {
+) -> Vec<ViewFiles> {
     let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
-    let training_folders: BTreeSet<&str> = training.map(ListedView::folder).collect();
+    let training_folders: BTreeSet<&str> = training.map(ViewEntry::folder).collect();
     // A file that is listed for one view is not the reference image of another.
     let listed: HashSet<&PathBuf> = frames.iter().filter_map(|frame| frame.file.as_ref()).collect();
     let mut sources = Vec::new();
@@ -318,7 +318,7 @@ fn sources(
             let depth = (options.depth.load && split == Split::Train)
                 .then(|| frame.depth_file(root, options.depth.folder.as_deref(), files))
                 .flatten();
-            sources.push(Source {
+            sources.push(ViewFiles {
                 name: frame.name.clone(),
                 split,
                 lens: frame.lens,
@@ -343,21 +343,21 @@ fn sources(
     sources
 }
 
-impl ListedView {
+impl ViewEntry {
     /// The folder of the listed path.
     fn folder(&self) -> &str {
         self.listed.rsplit_once('/').map_or("", |(folder, _)| folder)
     }
 
     /// The photograph of the same name in another folder: at the same relative path, or directly in it.
-    fn find(&self, folder: &Path, files: &Files) -> Option<PathBuf> {
+    fn find(&self, folder: &Path, files: &PhotographFiles) -> Option<PathBuf> {
         files
             .find(folder, names::below_first(&self.listed))
             .or_else(|| files.find(folder, &self.name))
     }
 
     /// The dark photograph; the listed file, unless there is a darker one next to it.
-    fn input(&self, root: &Path, lists_input: bool, files: &Files) -> Option<PathBuf> {
+    fn input(&self, root: &Path, lists_input: bool, files: &PhotographFiles) -> Option<PathBuf> {
         if self.folder().split('/').any(|part| DARK_FOLDERS.contains(&part)) {
             return self.file.clone();
         }
@@ -366,7 +366,12 @@ impl ListedView {
     }
 
     /// The depth map: the listed one, or one with the photograph's name or that name with the prefix `depth_`.
-    fn depth_file(&self, root: &Path, folder: Option<&Path>, files: &Files) -> Option<PathBuf> {
+    fn depth_file(
+        &self,
+        root: &Path,
+        folder: Option<&Path>,
+        files: &PhotographFiles,
+    ) -> Option<PathBuf> {
         if folder.is_none() && self.depth.is_some() {
             return self.depth.clone();
         }
@@ -380,7 +385,12 @@ impl ListedView {
     }
 
     /// The normal-light photograph: the listed file if it is not the input, else one of the same name next to it.
-    fn reference(&self, root: &Path, input: Option<&PathBuf>, files: &Files) -> Option<PathBuf> {
+    fn reference(
+        &self,
+        root: &Path,
+        input: Option<&PathBuf>,
+        files: &PhotographFiles,
+    ) -> Option<PathBuf> {
         let beside =
             NORMAL_FOLDERS.iter().filter_map(|folder| self.find(&root.join(folder), files));
         self.file.clone().into_iter().chain(beside).find(|file| Some(file) != input)

@@ -27,10 +27,10 @@ mod validate;
 
 use serde::Serialize;
 
-pub use self::histogram::{Cell, Column, Histogram};
-use self::model::Model;
+pub use self::histogram::{Histogram, HistogramCell, HistogramColumn};
+use self::model::FitModel;
 pub use self::model::psnr;
-pub use self::pairs::{FitScene, Pair, Scene};
+pub use self::pairs::{FitScene, Pair, PairScene};
 pub use self::profile::{
     ColourPair, ColourScene, ProfileFold, ProfileScores, cross_validate_profile, fit_profile,
     profile_scores,
@@ -135,7 +135,7 @@ pub struct Estimate {
 
 /// A family fitted to pairs.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Fit {
+pub struct CurveFit {
     /// The curve with the fitted constants, for `--curve`.
     pub settings: ToneSettings,
     /// The fitted constants.
@@ -159,12 +159,12 @@ pub struct Fit {
     /// Whether it never exceeds 1 in that range.
     pub bounded: bool,
     /// The mean PSNR of the pairs over all channels, dB: for this fit, for the family's own constants, and for AP3.
-    pub psnr: Scores,
+    pub psnr: CurveScores,
 }
 
 /// A score of three curves.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Scores {
+pub struct CurveScores {
     /// With the fitted constants.
     pub fitted: f64,
     /// With the constants in the family's row.
@@ -173,9 +173,9 @@ pub struct Scores {
     pub ap3: f64,
 }
 
-impl Scores {
+impl CurveScores {
     /// The scores of the fitted settings, of their family and of AP3.
-    fn of(settings: &ToneSettings, score: impl Fn(&ToneSettings) -> f64) -> Self {
+    fn new(settings: &ToneSettings, score: impl Fn(&ToneSettings) -> f64) -> Self {
         Self {
             fitted: score(settings),
             frozen: score(&ToneSettings::new(settings.curve.clone())),
@@ -205,9 +205,9 @@ fn mean_squared_error(settings: &ToneSettings, pairs: &[&Pair]) -> f64 {
 
 /// Fits the family's constants to the pairs; for curves that adapt to a photograph, also black level (alpha) and gain
 /// (c, g0); for those that scale by a mean, also the target mean theta.
-pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Result<Fit> {
+pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Result<CurveFit> {
     options.check()?;
-    let model = Model::new(family, options)?;
+    let model = FitModel::new(family, options)?;
     let Some(first) = pairs.first() else {
         return Err(Error::Usage("there are no pairs to fit to".to_owned()));
     };
@@ -226,15 +226,15 @@ pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Re
     let settings = model.settings(&solution.values);
     settings.check()?;
 
-    let residuals = Residuals::of(&model, &solution, pairs, options.channels);
+    let residuals = Residuals::new(&model, &solution, pairs, options.channels);
     let mut sizes = solver.sizes(&solution.values);
     let limit = solution.delta.unwrap_or(f64::INFINITY);
     let huber_loss =
         |size: f64| if size <= limit { 0.5 * size * size } else { limit * (size - 0.5 * limit) };
     let robust_loss =
         sizes.iter().map(|(size, count)| count * huber_loss(*size)).sum::<f64>() / residuals.count;
-    let confidence = confidence::of(&model, &solver.groups, &solution, &residuals);
-    Ok(Fit {
+    let confidence = confidence::estimate(&model, &solver.groups, &solution, &residuals);
+    Ok(CurveFit {
         constants: confidence.estimates,
         values: residuals.count,
         effective_values: confidence.effective_values,
@@ -246,7 +246,7 @@ pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Re
             .then(|| 1.0 - residuals.squares / residuals.count / residuals.variance),
         rises: solution.rises,
         bounded: solution.bounded,
-        psnr: Scores::of(&settings, |settings| mean_psnr(settings, pairs)),
+        psnr: CurveScores::new(&settings, |settings| mean_psnr(settings, pairs)),
         settings,
     })
 }
@@ -264,7 +264,7 @@ struct Residuals {
 }
 
 impl Residuals {
-    fn of(model: &Model, solution: &Solution, pairs: &[&Pair], channels: Channels) -> Self {
+    fn new(model: &FitModel, solution: &Solution, pairs: &[&Pair], channels: Channels) -> Self {
         let (mut count, mut squares, mut weighted_squares, mut means) = (0.0, 0.0, 0.0, vec![]);
         let [mut sum_y, mut sum_y2] = [0.0; 2];
         for (pair, weight) in pairs.iter().zip(&solution.weights) {

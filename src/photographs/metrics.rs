@@ -23,7 +23,7 @@ impl Scores {
     ///
     /// # Errors
     /// [`Error::Usage`] if the images differ in size.
-    pub fn of(render: &Image, reference: &Image) -> Result<Self> {
+    pub fn measure(render: &Image, reference: &Image) -> Result<Self> {
         Self::of_counted(render, reference, None)
     }
 

@@ -19,7 +19,7 @@ pub use self::cameras::describe;
 pub use self::reconstruction::{Mapper, Matcher};
 pub use self::tool::how_to_install;
 
-use self::pictures::{BRIGHT, Pictures, bright_name, is_dark};
+use self::pictures::{BRIGHT, PosePhotographs, bright_name, is_dark};
 use self::reconstruction::Reconstruction;
 use self::tool::Tool;
 use self::unfinished::Unfinished;
@@ -68,7 +68,7 @@ pub struct PoseOptions {
 
 /// Progress of [`estimate`].
 #[derive(Clone, Copy, Debug)]
-pub enum Progress<'a> {
+pub enum PoseProgress<'a> {
     /// A line about a finished or running stage.
     Line(&'a str),
     /// Photographs done in the current pass over them.
@@ -97,7 +97,7 @@ pub struct Posed {
 const MIN_CAMERAS: usize = 3;
 
 /// Estimates the cameras and writes the dataset.
-pub fn estimate(options: &PoseOptions, report: &dyn Fn(Progress<'_>)) -> Result<Posed> {
+pub fn estimate(options: &PoseOptions, report: &dyn Fn(PoseProgress<'_>)) -> Result<Posed> {
     if !(options.fps > 0.0 && options.fps <= 240.0) {
         let problem = format!("--fps is {}; it must be above 0 and at most 240", options.fps);
         return Err(Error::Usage(problem));
@@ -119,7 +119,7 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(Progress<'_>)) -> Result<
         distinct_photographs(&folder)?
     };
     let gpu = (options.open)(&options.device)?;
-    let mut pictures = Pictures { dark, bright, copies: out.work.join("tone-mapped") };
+    let mut pictures = PosePhotographs { dark, bright, copies: out.work.join("tone-mapped") };
     brighten(&gpu, &mut pictures, report)?;
     let all = pictures.dark.len();
     let models = reconstruction.models(&pictures, report)?;
@@ -149,7 +149,7 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(Progress<'_>)) -> Result<
     out.finish()?;
     let placed = dark.len();
     let target = options.out.display();
-    report(Progress::Line(&format!("{placed} of {all} photographs have a camera -> {target}")));
+    report(PoseProgress::Line(&format!("{placed} of {all} photographs have a camera -> {target}")));
     warn_of(&lenses, &pictures.dark, &dark);
     let bright = options.with.as_ref().map(|_| [bright.len(), pictures.bright.len()]);
     Ok(Posed { photographs: all, placed, bright, lenses })
@@ -170,15 +170,21 @@ fn matcher(options: &PoseOptions, is_clip: bool) -> Result<Matcher> {
 
 /// Writes the tone-mapped copies. Bright photographs have a curve of their own, which leaves those in normal light as
 /// they are.
-fn brighten(gpu: &Gpu, pictures: &mut Pictures, report: &dyn Fn(Progress<'_>)) -> Result<()> {
-    let Pictures { dark, bright, copies } = pictures;
+fn brighten(
+    gpu: &Gpu,
+    pictures: &mut PosePhotographs,
+    report: &dyn Fn(PoseProgress<'_>),
+) -> Result<()> {
+    let PosePhotographs { dark, bright, copies } = pictures;
     let gain = tone_mapped::write(gpu, dark, copies, report)?;
     let count = dark.len();
-    report(Progress::Line(&format!("{count} photographs brightened (gain {gain:.1})")));
+    report(PoseProgress::Line(&format!("{count} photographs brightened (gain {gain:.1})")));
     if !bright.is_empty() {
         let gain = tone_mapped::write(gpu, bright, &copies.join(BRIGHT), report)?;
         let count = bright.len();
-        report(Progress::Line(&format!("{count} bright photographs beside them (gain {gain:.1})")));
+        report(PoseProgress::Line(&format!(
+            "{count} bright photographs beside them (gain {gain:.1})"
+        )));
     }
     Ok(())
 }

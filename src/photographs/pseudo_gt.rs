@@ -10,7 +10,7 @@
 mod encoded;
 mod photographs;
 
-pub use encoded::Encoded;
+pub use encoded::EncodedPlanes;
 
 use std::sync::OnceLock;
 
@@ -89,11 +89,11 @@ impl PseudoGt {
     pub fn record<'a>(
         &self,
         pass: &mut Recorder<'_>,
-        photograph: &'a Encoded,
+        photograph: &'a EncodedPlanes,
         curve: Option<(&Buffer<ToneParameters>, u32)>,
         target: &'a mut Buffer<f32>,
     ) -> Result<&'a Buffer<f32>> {
-        let &Encoded { code_bits, value_count, ref codes, ref values } = photograph;
+        let &EncodedPlanes { code_bits, value_count, ref codes, ref values } = photograph;
         if code_bits == 32 && curve.is_none() {
             return Ok(values);
         }
@@ -144,15 +144,15 @@ impl PseudoGt {
         code_bits: u32,
         with_curve: bool,
     ) -> Result<&Pipeline<kernels::pseudo_gt::Kernel>> {
-        let place = CODE_BITS.iter().position(|&bits| bits == code_bits).unwrap_or_default();
+        let index = CODE_BITS.iter().position(|&bits| bits == code_bits).unwrap_or_default();
         let pipelines = if with_curve { &self.with_curve } else { &self.decoders };
-        if let Some(pipeline) = pipelines[place].get() {
+        if let Some(pipeline) = pipelines[index].get() {
             return Ok(pipeline);
         }
         let tone_curve = self.tone_curve;
         let constants = kernels::pseudo_gt::Constants { code_bits, with_curve, tone_curve };
         let pipeline = self.gpu.pipeline(&constants)?;
-        Ok(pipelines[place].get_or_init(|| pipeline))
+        Ok(pipelines[index].get_or_init(|| pipeline))
     }
 }
 

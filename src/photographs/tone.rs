@@ -48,7 +48,7 @@ pub(crate) use self::curve::{clamped, curve_at, tone_curve};
 #[cfg(feature = "io")]
 pub(crate) use self::exposure::all_black;
 #[cfg(feature = "io")]
-pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
+pub use self::exposure::{Exposure, exposure_knots, is_black, soft};
 pub use self::families::{Constant, FAMILIES, Family, ToneCurve, White};
 #[cfg(feature = "io")]
 pub use self::file::CurveChoice;
@@ -224,7 +224,7 @@ impl From<ToneCurve> for Tone {
 #[cfg(feature = "io")]
 impl PartialEq<ToneCurve> for Tone {
     fn eq(&self, curve: &ToneCurve) -> bool {
-        matches!(self, Self::Formula(own) if own == curve)
+        matches!(self, Self::Formula(formula) if formula == curve)
     }
 }
 

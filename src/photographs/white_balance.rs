@@ -139,11 +139,11 @@ fn grey_patch(corners: [[f64; 2]; 4], patch: u32) -> Vec<[u32; 2]> {
     let sample = |index: u32| {
         let part = [index % SAMPLES, index / SAMPLES]
             .map(|at| 0.3 + 0.4 * (f64::from(at) + 0.5) / f64::from(SAMPLES));
-        let place =
+        let position =
             map * DVec3::new((f64::from(patch) + part[0]) / 6.0, (3.0 + part[1]) / 4.0, 1.0);
         // A position left of or above the photograph is moved beyond its right or bottom edge.
         let pixel = |value: f64| if value >= 0.0 { value as u32 } else { u32::MAX };
-        [pixel(place.x / place.z), pixel(place.y / place.z)]
+        [pixel(position.x / position.z), pixel(position.y / position.z)]
     };
     (0..SAMPLES * SAMPLES).map(sample).collect()
 }
@@ -334,8 +334,8 @@ mod tests {
         let map = homography(corners).inverse();
         let light = [0.3, 0.2, 0.1];
         let image = Image::from_fn(60, 40, |x, y| {
-            let place = map * DVec3::new(f64::from(x) + 0.5, f64::from(y) + 0.5, 1.0);
-            let [u, v] = [place.x / place.z, place.y / place.z];
+            let position = map * DVec3::new(f64::from(x) + 0.5, f64::from(y) + 0.5, 1.0);
+            let [u, v] = [position.x / position.z, position.y / position.z];
             let is_grey = (0.75..1.0).contains(&v) && (0.0..1.0).contains(&u);
             let grey = [0.9, 0.6, 0.36, 0.2, 0.09, 0.03][((6.0 * u) as usize).min(5)];
             light.map(|light: f32| srgb_from_linear(if is_grey { light * grey } else { 0.5 }))

@@ -13,7 +13,7 @@ pub(super) fn stepped<T: Real>(
     [rate, second_correction]: [f32; 2],
     [p, g, m, v]: [f32; 4],
 ) -> [T; 3] {
-    let of = |x: f32| T::of(x.into());
+    let of = |x: f32| T::from_f64(x.into());
     let g = clamp_gradient(g);
     let [old, new] = [BETA1, 1.0 - BETA1].map(|beta| of(beta as f32));
     let m = old * of(m) + new * of(g);
@@ -59,7 +59,8 @@ fn updated<T: Real>(params: &Params, column: usize, before: [f32; 4]) -> [T; 3] 
 
 /// The parameter, which has bounds in the plane of the log scales, and both moments.
 pub(super) fn bounded<T: Real>(plane: usize, [p, m, v]: [T; 3]) -> [T; 3] {
-    let [low, high] = [LOG_SCALE_MIN, LOG_SCALE_MAX].map(|bound| T::of((bound as f32).into()));
+    let [low, high] =
+        [LOG_SCALE_MIN, LOG_SCALE_MAX].map(|bound| T::from_f64((bound as f32).into()));
     let bounded = match plane == Attribute::LogScales as usize {
         // Written so that a NaN stays one.
         true if p < low => low,

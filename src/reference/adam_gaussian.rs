@@ -1,7 +1,7 @@
 use glam::DVec3;
 
 use super::adam::{bounded, stepped};
-use super::camera::Camera;
+use super::camera::ReferenceCamera;
 use super::gaussian::Planes;
 use super::rounding::{Rounded, UNIT};
 use super::sh::sh_basis;
@@ -30,7 +30,7 @@ fn updates(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<U
     let Constants { sh_degree, feature_count, rest_by_column, frozen_columns } = *constants;
     let count = params.gaussian_count as usize;
     let layout = Planes { count, feature_count: feature_count as usize, sh_degree, rest_by_column };
-    let camera = Camera::from(&cameras[params.camera_index as usize]);
+    let camera = ReferenceCamera::from(&cameras[params.camera_index as usize]);
     let left_out = frozen_floats(frozen_columns, count);
     let of_gaussian = |i: usize| {
         let numbers: Vec<usize> = layout.places(i).collect();

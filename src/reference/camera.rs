@@ -13,7 +13,7 @@ use pinhole::Pinhole;
 
 /// A camera as in the buffer of cameras.
 #[derive(Clone, Debug)]
-pub struct Camera {
+pub struct ReferenceCamera {
     /// The rotation from world to view.
     pub rotation: DMat3,
     /// The translation from world to view.
@@ -25,12 +25,12 @@ pub struct Camera {
     /// Pixels.
     pub size: DVec2,
     /// The projection, in units of the focal lengths.
-    pub model: Model,
+    pub model: ReferenceLens,
 }
 
 /// A camera model.
 #[derive(Clone, Debug)]
-pub enum Model {
+pub enum ReferenceLens {
     /// `include/camera_pinhole.glsl`
     Pinhole(Pinhole),
     /// `include/camera_fisheye.glsl`
@@ -46,16 +46,16 @@ pub struct ImagePoint {
     pub jacobian: [DVec3; 2],
 }
 
-impl From<&kernels::Camera> for Camera {
+impl From<&kernels::Camera> for ReferenceCamera {
     fn from(camera: &kernels::Camera) -> Self {
         let [x, y, z, translation] =
             camera.view_from_world.map(|column| DVec3::from(column.map(f64::from)));
         let model = match camera.model {
-            CAMERA_FISHEYE => Model::Fisheye(Fisheye {
+            CAMERA_FISHEYE => ReferenceLens::Fisheye(Fisheye {
                 distortion: camera.distortion.map(f64::from),
                 largest_angle: camera.largest_angle.into(),
             }),
-            _ => Model::Pinhole(Pinhole {
+            _ => ReferenceLens::Pinhole(Pinhole {
                 min_slope: camera.min_slope.as_dvec2(),
                 max_slope: camera.max_slope.as_dvec2(),
             }),
@@ -71,7 +71,7 @@ impl From<&kernels::Camera> for Camera {
     }
 }
 
-impl Camera {
+impl ReferenceCamera {
     /// A point of the world in view coordinates.
     pub fn view(&self, point: DVec3) -> DVec3 {
         self.rotation * point + self.translation
@@ -85,52 +85,52 @@ impl Camera {
     /// The depth of a point in view coordinates; not positive if the model does not see it.
     pub fn depth(&self, point: DVec3) -> f64 {
         match &self.model {
-            Model::Pinhole(_) => point.z,
-            Model::Fisheye(fisheye) => fisheye.depth(point),
+            ReferenceLens::Pinhole(_) => point.z,
+            ReferenceLens::Fisheye(fisheye) => fisheye.depth(point),
         }
     }
 
     /// The pixel at which a point of positive depth is seen.
     pub fn project(&self, point: DVec3) -> DVec2 {
-        self.focal * self.place(point).at + self.principal_point
+        self.focal * self.image_point(point).at + self.principal_point
     }
 
     /// The derivative of the pixel with respect to the point, row by row.
     pub fn jacobian(&self, point: DVec3) -> [DVec3; 2] {
-        let [x, y] = self.place(point).jacobian;
+        let [x, y] = self.image_point(point).jacobian;
         [self.focal.x * x, self.focal.y * y]
     }
 
-    fn place(&self, point: DVec3) -> ImagePoint {
+    fn image_point(&self, point: DVec3) -> ImagePoint {
         match &self.model {
-            Model::Pinhole(pinhole) => pinhole.place(point),
-            Model::Fisheye(fisheye) => fisheye.place(point),
+            ReferenceLens::Pinhole(pinhole) => pinhole.image_point(point),
+            ReferenceLens::Fisheye(fisheye) => fisheye.image_point(point),
         }
     }
 
-    /// The gradient of the point, from those of its pixel and of the rows of [`Camera::jacobian`].
+    /// The gradient of the point, from those of its pixel and of the rows of [`ReferenceCamera::jacobian`].
     pub fn backward(&self, point: DVec3, d_pixel: DVec2, d_rows: [DVec3; 2]) -> DVec3 {
         let d_place = self.focal * d_pixel;
         let d_rows = [self.focal.x * d_rows[0], self.focal.y * d_rows[1]];
         match &self.model {
-            Model::Pinhole(pinhole) => pinhole.backward(point, d_place, d_rows),
-            Model::Fisheye(fisheye) => fisheye.backward(point, d_place, d_rows),
+            ReferenceLens::Pinhole(pinhole) => pinhole.backward(point, d_place, d_rows),
+            ReferenceLens::Fisheye(fisheye) => fisheye.backward(point, d_place, d_rows),
         }
     }
 
     /// The first-order change of depth between a point and another at an offset.
     pub(super) fn depth_change(&self, point: DVec3, offset: DVec3) -> f64 {
         match &self.model {
-            Model::Pinhole(_) => offset.z,
-            Model::Fisheye(_) => point.dot(offset) / point.length(),
+            ReferenceLens::Pinhole(_) => offset.z,
+            ReferenceLens::Fisheye(_) => point.dot(offset) / point.length(),
         }
     }
 
     /// The point moved to another depth.
     pub(super) fn at_depth(&self, point: DVec3, depth: f64) -> DVec3 {
         match &self.model {
-            Model::Pinhole(_) => point.truncate().extend(depth),
-            Model::Fisheye(_) => point * (depth / point.length()),
+            ReferenceLens::Pinhole(_) => point.truncate().extend(depth),
+            ReferenceLens::Fisheye(_) => point * (depth / point.length()),
         }
     }
 }

@@ -16,18 +16,18 @@ fn log_invariants(params: &Params, smooth_rows: &[Vec3], slope_rows: &[Vec3]) ->
             let neighbours = (0..13).filter_map(|k| Some((k, (i / width + k).checked_sub(6)?)));
             let inside = neighbours.filter(|&(_, y)| y < height);
             let term = |(k, y): (usize, usize)| {
-                Rounded::of(taps[k]) * Rounded::exact(rows[y * width + i % width][channel])
+                Rounded::from_f64(taps[k]) * Rounded::exact(rows[y * width + i % width][channel])
             };
             Rounded::sum(13.0, inside.map(term))
         };
-        let e = along(smooth_rows, 0, &smooth) + Rounded::of(EPSILON);
+        let e = along(smooth_rows, 0, &smooth) + Rounded::from_f64(EPSILON);
         let squares = (0..3).map(|channel| {
             let x = along(slope_rows, channel, &smooth) / e;
             let y = along(smooth_rows, channel, &slope) / e;
             // The kernel multiplies by the inverse.
             (x * x + y * y).rounded(2.0)
         });
-        (Rounded::sum(4.0, squares) + Rounded::of(EPSILON)).ln()
+        (Rounded::sum(4.0, squares) + Rounded::from_f64(EPSILON)).ln()
     };
     (0..width * height).map(log_invariant).collect()
 }
@@ -36,7 +36,7 @@ fn log_invariants(params: &Params, smooth_rows: &[Vec3], slope_rows: &[Vec3]) ->
 fn moments(params: &Params, logs: &[Rounded]) -> impl Iterator<Item = [Rounded; 2]> {
     logs.chunks(params.pixels_per_moment as usize).map(|logs| {
         let (count, chain) = (logs.len() as f64, chain(logs.len()));
-        let mean = Rounded::sum(chain, logs.iter().copied()) / Rounded::of(count);
+        let mean = Rounded::sum(chain, logs.iter().copied()) / Rounded::from_f64(count);
         let squares = logs.iter().map(|&log| (log - mean) * (log - mean));
         [mean, Rounded::sum(chain, squares)]
     })

@@ -7,7 +7,7 @@ fn structure(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounde
     let [mean, scale] = slices.norm[0].to_array().map(Rounded::exact);
     let normalised = |&log: &f32| {
         let x = (Rounded::exact(log) - mean) * scale;
-        x.at_least(Rounded::of(0.0)).at_most(Rounded::of(1.0))
+        x.at_least(Rounded::from_f64(0.0)).at_most(Rounded::from_f64(1.0))
     };
     [slices.logs[..params.pixel_count as usize].iter().map(normalised).collect()]
 }

@@ -59,7 +59,7 @@ pub(super) fn copies<'a>(
 
 /// The attributes that density control changes.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Shape {
+pub struct ChildGaussian {
     /// World units.
     pub mean: Vec3,
     /// ln of the standard deviations, in world units.
@@ -69,7 +69,7 @@ pub struct Shape {
 }
 
 /// One half, the first or the second, of a Gaussian with this `rotation`, split along its longest axis.
-pub fn half_of(parent: &Shape, rotation: Quat, copy: u32) -> Shape {
+pub fn half_of(parent: &ChildGaussian, rotation: Quat, copy: u32) -> ChildGaussian {
     let log_scales = parent.log_scales;
     let (axis, longest) = (log_scales.max_position(), log_scales.max_element());
     let opacity = sigmoid(f64::from(parent.raw_opacity));
@@ -77,7 +77,7 @@ pub fn half_of(parent: &Shape, rotation: Quat, copy: u32) -> Shape {
     let mut factors = Vec3::splat((SPLIT_ACROSS + SPLIT_ACROSS_SLOPE * opacity) as f32);
     factors[axis] = (SPLIT_ALONG + SPLIT_ALONG_SLOPE * opacity) as f32;
     let offset = (if copy == 0 { SPLIT_OFFSET } else { -SPLIT_OFFSET }) as f32 * longest.exp();
-    Shape {
+    ChildGaussian {
         mean: parent.mean + rotation * (Vec3::AXES[axis] * offset),
         log_scales: log_scales + factors.ln(),
         raw_opacity: (new_opacity / (1.0 - new_opacity)).ln() as f32,
@@ -85,9 +85,9 @@ pub fn half_of(parent: &Shape, rotation: Quat, copy: u32) -> Shape {
 }
 
 /// A Gaussian whose position is drawn from the normal distribution of `parent`.
-fn drawn(parent: &Shape, rotation: Quat, is_split: bool, key: u32) -> Shape {
+fn drawn(parent: &ChildGaussian, rotation: Quat, is_split: bool, key: u32) -> ChildGaussian {
     let shrink = if is_split { PAPER_LOG_SPLIT_FACTOR as f32 } else { 0.0 };
-    Shape {
+    ChildGaussian {
         mean: parent.mean + rotation * (parent.log_scales.exp() * random_normal3(key)),
         log_scales: parent.log_scales - shrink,
         ..*parent
@@ -100,9 +100,9 @@ fn changed(count: usize) -> [usize; 3] {
         .map(|attribute| attribute.column(0) * count)
 }
 
-fn shape(parameters: &[f32], count: usize, i: usize) -> Shape {
+fn shape(parameters: &[f32], count: usize, i: usize) -> ChildGaussian {
     let [means, log_scales, raw_opacities] = changed(count);
-    Shape {
+    ChildGaussian {
         mean: Vec3::from_slice(&parameters[means + 3 * i..]),
         log_scales: Vec3::from_slice(&parameters[log_scales + 3 * i..]),
         raw_opacity: parameters[raw_opacities + i],

@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec2};
 
-use super::camera::Camera;
+use super::camera::ReferenceCamera;
 use super::gaussian::{Gaussian, Planes, Words, sigmoid};
 use super::rotation::{rotation, unit_quat};
 use super::rounding::UNIT;
@@ -25,7 +25,7 @@ fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
 /// An estimate of the mean squared change of a view by a split, in units of the squared contrast of the area that the
 /// Gaussian covers: the fraction of the view that it covers, times the square of its opacity and of the relative change
 /// of depth.
-pub(super) fn view_change(near: f64, camera: &Camera, gaussian: &Gaussian) -> f64 {
+pub(super) fn view_change(near: f64, camera: &ReferenceCamera, gaussian: &Gaussian) -> f64 {
     let opacity = sigmoid(gaussian.raw_opacity);
     let scale = DMat3::from_diagonal(gaussian.log_scale.exp());
     let view_axes = camera.rotation * rotation(unit_quat(gaussian.quat)) * scale;
@@ -58,7 +58,8 @@ fn largest_change(params: &Params, slices: &Slices<'_>, i: usize) -> f64 {
     let planes = Planes { count, feature_count: 0, sh_degree: 0, rest_by_column: false };
     let gaussian = planes.load(slices.parameters, i);
     let cameras = slices.cameras.iter().take(params.camera_count as usize);
-    let change = |camera| view_change(params.near.into(), &Camera::from(camera), &gaussian);
+    let change =
+        |camera| view_change(params.near.into(), &ReferenceCamera::from(camera), &gaussian);
     let most = |most: f64, one: f64| if most >= one { most } else { one };
     cameras.map(change).fold(0.0, |a, b| if f64::is_nan(a) { a } else { most(a, b) })
 }

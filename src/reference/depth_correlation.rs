@@ -17,13 +17,13 @@ pub struct Pearson<T> {
 
 /// P from the sums of aa, ab and bb about the means of `n` values.
 pub fn pearson<T: Real>(n: f64, [aa, ab, bb]: [T; 3]) -> Pearson<T> {
-    let (zero, one) = (T::of(0.0), T::of(1.0));
+    let (zero, one) = (T::from_f64(0.0), T::from_f64(1.0));
     if aa == zero || bb == zero {
         return Pearson { value: one, a_scale: zero, b_scale: zero };
     }
-    let [all, others] = [T::of(n), T::of(n - 1.0)];
+    let [all, others] = [T::from_f64(n), T::from_f64(n - 1.0)];
     let [deviation_a, deviation_b] = [aa, bb].map(|sum| (sum / others).sqrt());
-    let [a, b] = [deviation_a, deviation_b].map(|deviation| deviation + T::of(EPSILON));
+    let [a, b] = [deviation_a, deviation_b].map(|deviation| deviation + T::from_f64(EPSILON));
     let correlation = ab / all / a / b;
     Pearson {
         value: one - correlation,
@@ -43,12 +43,12 @@ fn correlation(params: &Params, slices: &Slices<'_>, region: usize) -> [Rounded;
             (first, params.box_chunks, params.box_weight)
         }
     };
-    let (chain, n) = (chain(count as usize), Rounded::of(pixels.into()));
+    let (chain, n) = (chain(count as usize), Rounded::from_f64(pixels.into()));
     let chunks = || {
         let of = &slices.moments[first as usize..][..count as usize];
         (0..).zip(of).map(|(i, of)| {
             let values = params.chunk_size.min(pixels - i * params.chunk_size);
-            (Rounded::of(values.into()), of.mean.to_array().map(Rounded::exact), of.products)
+            (Rounded::from_f64(values.into()), of.mean.to_array().map(Rounded::exact), of.products)
         })
     };
     let mean =

@@ -20,7 +20,7 @@ fn moments(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>
         let end = (width * height).min(first + params.chunk_size as usize);
         let values: Vec<[Rounded; 2]> =
             (first..end).map(value).map(|[a, b]| [a - pivot_a, b - pivot_b]).collect();
-        let (chain, count) = (chain(values.len()), Rounded::of(values.len() as f64));
+        let (chain, count) = (chain(values.len()), Rounded::from_f64(values.len() as f64));
         let mean = [0, 1].map(|c| Rounded::sum(chain, values.iter().map(|v| v[c])) / count);
         let [aa, ab, bb] = [(0, 0), (0, 1), (1, 1)].map(|(c, d)| {
             let products = values.iter().map(|v| (v[c] - mean[c]) * (v[d] - mean[d]));

@@ -8,7 +8,7 @@ use crate::photographs::tone::Real;
 /// Gain and bias of a channel of a view, in any number type.
 pub fn gain_and_bias<T: Real>(exposures: &[T], view: usize, channel: usize) -> [T; 2] {
     let at = view * EXPOSURE_WIDTH as usize + channel;
-    [exposures[at].exp(), T::of(BIAS_SCALE) * exposures[at + 3]]
+    [exposures[at].exp(), T::from_f64(BIAS_SCALE) * exposures[at + 3]]
 }
 
 /// Whether a target is clipped at that of white.

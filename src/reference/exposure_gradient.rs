@@ -15,7 +15,7 @@ fn gradients(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounde
             Rounded::sum(chain(chunks), terms)
         };
         gradients[view * width + channel] = sum(0);
-        gradients[view * width + channel + 3] = Rounded::of(BIAS_SCALE) * sum(1);
+        gradients[view * width + channel + 3] = Rounded::from_f64(BIAS_SCALE) * sum(1);
     }
     [gradients]
 }

@@ -70,7 +70,7 @@ impl Words {
 
 impl Planes {
     /// The planes of this many Gaussians whose splats have this many channels: colour, and the features after it.
-    pub(super) fn of(
+    pub(super) fn new(
         gaussian_count: u32,
         channels: u32,
         sh_degree: u32,

@@ -15,7 +15,7 @@ pub const WIDTH: usize = LAMP_WIDTH as usize;
 
 /// A lamp, from the numbers of the device.
 #[derive(Clone, Copy, Debug)]
-pub struct Lamp {
+pub struct ReferenceLamp {
     numbers: [f64; LAMP_NUMBERS as usize],
     position: DVec3,
     /// (x, y, 1)
@@ -40,9 +40,9 @@ struct LampPoint {
     light: f64,
 }
 
-impl Lamp {
+impl ReferenceLamp {
     /// The lamp of these numbers, (`LAMP_NUMBERS`).
-    pub fn of<T: Copy + Into<f64>>(numbers: &[T]) -> Self {
+    pub fn from_numbers<T: Copy + Into<f64>>(numbers: &[T]) -> Self {
         let numbers: [f64; LAMP_NUMBERS as usize] = std::array::from_fn(|n| numbers[n].into());
         let at = |n: u32| numbers[n as usize];
         let softplus = |x: f64| x.max(0.0) + (-x.abs()).exp().ln_1p();
@@ -160,7 +160,7 @@ impl Lamp {
         self.slope * self.share(&at) / at.distance * gradient
     }
 
-    /// The rounding error of [`Lamp::point_gradient`], whose terms can cancel.
+    /// The rounding error of [`ReferenceLamp::point_gradient`], whose terms can cancel.
     pub(super) fn point_gradient_error(&self, point: DVec3) -> f64 {
         let at = self.at(point);
         let terms = self.exponent + 2.0 * self.falloffs[0] + 8.0 * self.falloffs[1];

@@ -2,8 +2,8 @@
 
 use glam::DVec3;
 
-use super::camera::Camera;
-use super::lamp::{Lamp, WIDTH};
+use super::camera::ReferenceCamera;
+use super::lamp::{ReferenceLamp, WIDTH};
 use super::rounding::{Rounded, UNIT, bounds_from, chain, sensitivity, write};
 use super::splat::stored_color;
 use crate::gpu::Reference;
@@ -17,9 +17,10 @@ use crate::splats::batches::frozen_floats;
 const BEFORE_LAMP: usize = 9;
 
 /// A Gaussian's share of the gradient of the numbers.
-fn share(camera: &Camera, inputs: &[f64]) -> Vec<f64> {
+fn share(camera: &ReferenceCamera, inputs: &[f64]) -> Vec<f64> {
     let (gaussian, numbers) = inputs.split_at(BEFORE_LAMP);
-    let (point, lamp) = (camera.view(DVec3::from_slice(gaussian)), Lamp::of(numbers));
+    let (point, lamp) =
+        (camera.view(DVec3::from_slice(gaussian)), ReferenceLamp::from_numbers(numbers));
     let [lit, d_dc] = [3, 6].map(|at| DVec3::from_slice(&gaussian[at..]));
     let d = lamp.log_factor_gradient(lit, d_dc / SH_C0, point);
     lamp.gradient(point).map(|number| d * number).to_vec()
@@ -42,10 +43,10 @@ fn shares(
     if d_dc == DVec3::ZERO {
         return None;
     }
-    let camera = Camera::from(&slices.cameras[params.camera_index as usize]);
+    let camera = ReferenceCamera::from(&slices.cameras[params.camera_index as usize]);
     let color = vector(slices.colors, stored_color(constants.channels) * i);
     let mean = vector(slices.parameters, 3 * i);
-    let lamp = Lamp::of(slices.lamp);
+    let lamp = ReferenceLamp::from_numbers(slices.lamp);
     let mut inputs = [mean, color, d_dc].map(|vector| vector.to_array()).concat();
     let far = DVec3::splat(mean.length() + camera.center().length());
     let mut errors = [far, DVec3::ONE + color.abs(), d_dc.abs()]

@@ -8,7 +8,7 @@ fn shown(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 
     let value = |i: usize| {
         let [weight, render, target] =
             [slices.weights[i % pixels], slices.render[i], slices.target[i]].map(Rounded::exact);
-        let of_target = Rounded::of(1.0) - weight;
+        let of_target = Rounded::from_f64(1.0) - weight;
         if weight.value >= 1.0 { render } else { weight * render + of_target * target }
     };
     [(0..params.value_count as usize).map(value).collect()]

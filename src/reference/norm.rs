@@ -7,7 +7,7 @@ use crate::photographs::tone::Real;
 
 /// Mean and 1 / standard deviation.
 #[derive(Clone, Copy, Debug)]
-pub struct Statistics<T = f64> {
+pub struct NormStatistics<T = f64> {
     /// Mean of the channel.
     pub mean: T,
     /// 1 / sqrt(variance + EPSILON).
@@ -16,7 +16,7 @@ pub struct Statistics<T = f64> {
 
 /// gamma and beta of a channel.
 #[derive(Clone, Copy, Debug)]
-pub struct Affine<T = f64> {
+pub struct NormAffine<T = f64> {
     /// The scale.
     pub gamma: T,
     /// The shift.
@@ -24,18 +24,21 @@ pub struct Affine<T = f64> {
 }
 
 #[cfg(feature = "testing")]
-impl Statistics {
+impl NormStatistics {
     /// Those of a channel's values.
-    pub fn of(values: &[f64]) -> Self {
+    pub fn from_values(values: &[f64]) -> Self {
         let n = values.len() as f64;
         let mean = values.iter().sum::<f64>() / n;
         Self::new(mean, values.iter().map(|z| (z - mean).powi(2)).sum::<f64>() / n)
     }
 }
 
-impl<T: Real> Statistics<T> {
+impl<T: Real> NormStatistics<T> {
     pub(super) fn new(mean: T, variance: T) -> Self {
-        Self { mean, inverse_deviation: T::of(1.0) / (variance + T::of(EPSILON)).sqrt() }
+        Self {
+            mean,
+            inverse_deviation: T::from_f64(1.0) / (variance + T::from_f64(EPSILON)).sqrt(),
+        }
     }
 
     /// (z - mean) / deviation.
@@ -44,7 +47,7 @@ impl<T: Real> Statistics<T> {
     }
 }
 
-impl<T: Real> Affine<T> {
+impl<T: Real> NormAffine<T> {
     /// gamma n + beta: the input of the `ReLU`.
     pub fn apply(&self, normalised: T) -> T {
         self.gamma * normalised + self.beta
@@ -52,15 +55,15 @@ impl<T: Real> Affine<T> {
 }
 
 /// relu(gamma n + beta) of every value of a channel; a NaN stays one.
-pub fn forward<T: Real>(statistics: Statistics<T>, affine: Affine<T>, z: &[T]) -> Vec<T> {
-    let relu = |y: T| if y.partial_cmp(&y).is_none() { y } else { y.at_least(T::of(0.0)) };
+pub fn forward<T: Real>(statistics: NormStatistics<T>, affine: NormAffine<T>, z: &[T]) -> Vec<T> {
+    let relu = |y: T| if y.partial_cmp(&y).is_none() { y } else { y.at_least(T::from_f64(0.0)) };
     z.iter().map(|&z| relu(affine.apply(statistics.normalised(z)))).collect()
 }
 
 /// `d_y` and `d_y` n of every value.
 pub fn backward_terms<T: Gated>(
-    statistics: Statistics<T>,
-    affine: Affine<T>,
+    statistics: NormStatistics<T>,
+    affine: NormAffine<T>,
     z: &[T],
     d_output: &[T],
 ) -> impl Iterator<Item = [T; 2]> {
@@ -74,8 +77,8 @@ pub fn backward_terms<T: Gated>(
 /// The sums over the values of `d_y` and of `d_y` n: the gradients of beta and of gamma.
 #[cfg(feature = "testing")]
 pub fn backward_sums(
-    statistics: Statistics,
-    affine: Affine,
+    statistics: NormStatistics,
+    affine: NormAffine,
     z: &[f64],
     d_output: &[f64],
 ) -> [f64; 2] {
@@ -85,8 +88,8 @@ pub fn backward_sums(
 
 /// The gradient of every value, given the sums of [`backward_sums`] divided by the number of values.
 pub fn backward<T: Gated>(
-    statistics: Statistics<T>,
-    affine: Affine<T>,
+    statistics: NormStatistics<T>,
+    affine: NormAffine<T>,
     means: [T; 2],
     z: &[T],
     d_output: &[T],
@@ -100,7 +103,7 @@ pub fn backward<T: Gated>(
     z.iter().zip(d_output).map(one).collect()
 }
 
-impl From<ChannelStatistics> for Statistics<Rounded> {
+impl From<ChannelStatistics> for NormStatistics<Rounded> {
     fn from(statistics: ChannelStatistics) -> Self {
         Self {
             mean: Rounded::exact(statistics.mean),
@@ -115,10 +118,10 @@ pub(super) fn affine(
     offset: u32,
     channels: u32,
     channel: usize,
-) -> Affine<Rounded> {
+) -> NormAffine<Rounded> {
     let at = offset as usize + channel;
     let [gamma, beta] = [at, at + channels as usize].map(|at| Rounded::exact(values[at]));
-    Affine { gamma, beta }
+    NormAffine { gamma, beta }
 }
 
 /// Channel `channel` of an image.

@@ -10,7 +10,7 @@ fn d_source(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded
         let affine = affine(slices.values, offset, channel_count, channel);
         let statistics = slices.statistics[slot as usize + channel].into();
         let sums = slices.sums[channel].to_array().map(Rounded::exact);
-        let means = sums.map(|sum| sum / Rounded::of(pixel_count.into()));
+        let means = sums.map(|sum| sum / Rounded::from_f64(pixel_count.into()));
         let [z, d] =
             [slices.source, slices.d_target].map(|image| plane(image, pixel_count, channel));
         backward(statistics, affine, means, &z, &d)

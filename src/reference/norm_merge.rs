@@ -1,4 +1,4 @@
-use super::norm::Statistics;
+use super::norm::NormStatistics;
 use super::rounding::{Rounded, bounds_from, chain, write};
 use crate::gpu::Reference;
 use crate::kernels::norm_merge::{Constants, Kernel, Params, Slices, Tolerances};
@@ -7,12 +7,12 @@ use crate::photographs::tone::Real;
 /// Mean and 1 / standard deviation of every channel.
 fn merged(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Rounded> {
     let (pixels, chunk) = (params.pixel_count as usize, constants.chunk as usize);
-    let (chunks, n) = (pixels.div_ceil(chunk), Rounded::of(pixels as f64));
+    let (chunks, n) = (pixels.div_ceil(chunk), Rounded::from_f64(pixels as f64));
     let channel = |channel: usize| {
         let partials = || {
             let all = slices.partials[channel * chunks..][..chunks].iter().enumerate();
             all.map(|(k, partial)| {
-                let count = Rounded::of(chunk.min(pixels - k * chunk) as f64);
+                let count = Rounded::from_f64(chunk.min(pixels - k * chunk) as f64);
                 (count, partial.to_array().map(Rounded::exact))
             })
         };
@@ -20,7 +20,7 @@ fn merged(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Ro
         let mean = sum(&mut partials().map(|(count, [mean, _])| count * mean)) / n;
         let squares = sum(&mut partials()
             .map(|(count, [of, squares])| squares + count * ((of - mean) * (of - mean))));
-        let statistics = Statistics::new(mean, squares / n);
+        let statistics = NormStatistics::new(mean, squares / n);
         [statistics.mean, statistics.inverse_deviation]
     };
     (0..params.channel_count as usize).flat_map(channel).collect()

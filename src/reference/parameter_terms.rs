@@ -11,7 +11,7 @@ use crate::splats::batches::frozen_floats;
 
 /// A value that a term sums, and its derivative with respect to the parameter, in any number type.
 fn opacity<T: Real>(raw: T) -> [T; 2] {
-    let one = T::of(1.0);
+    let one = T::from_f64(1.0);
     let opacity = one / (one + (-raw).exp());
     [opacity, opacity * (one - opacity)]
 }
@@ -74,14 +74,14 @@ fn scales(gaussian_count: usize) -> Range<usize> {
 }
 
 /// The values of the terms, and the updated gradients.
-struct Outcome {
+struct ParameterTermValues {
     opacities: Vec<Rounded>,
     scales: Vec<Rounded>,
     ratios: Vec<Rounded>,
     gradients: Vec<Rounded>,
 }
 
-fn outcome(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Outcome {
+fn outcome(params: &Params, constants: &Constants, slices: &Slices<'_>) -> ParameterTermValues {
     let count = params.gaussian_count as usize;
     let frozen = constants.frozen_columns as usize * count;
     let left_out = frozen_floats(constants.frozen_columns, count);
@@ -117,12 +117,13 @@ fn outcome(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Outco
             }
         }
     }
-    Outcome { opacities, scales: all_scales, ratios, gradients }
+    ParameterTermValues { opacities, scales: all_scales, ratios, gradients }
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Outcome { opacities, scales, ratios, gradients } = outcome(params, constants, &slices);
+        let ParameterTermValues { opacities, scales, ratios, gradients } =
+            outcome(params, constants, &slices);
         write(gradients, slices.gradients);
         let partials = [slices.opacity_partials, slices.scale_partials, slices.ratio_partials];
         for (partials, values) in partials.into_iter().zip([opacities, scales, ratios]) {
@@ -131,7 +132,8 @@ impl Reference for Kernel {
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let Outcome { opacities, scales, ratios, gradients } = outcome(params, constants, &slices);
+        let ParameterTermValues { opacities, scales, ratios, gradients } =
+            outcome(params, constants, &slices);
         // A gradient that no term adds to keeps its bits.
         let bound = |(gradient, &before): (&Rounded, &f32)| {
             if gradient.value == f64::from(before) { 0.0 } else { gradient.bound() }

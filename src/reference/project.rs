@@ -2,9 +2,9 @@
 
 use glam::{DMat3, DVec2, DVec3, DVec4, UVec2};
 
-use super::camera::Camera;
+use super::camera::ReferenceCamera;
 use super::gaussian::{Gaussian, Planes, sigmoid};
-use super::lamp::Lamp;
+use super::lamp::ReferenceLamp;
 use super::rotation::{rotation, unit_quat};
 use super::rounding::{UNIT, sensitivity};
 use super::sh::sh_basis;
@@ -42,12 +42,12 @@ pub struct ProjectionSettings {
     /// Opacities are compensated for the dilation.
     pub antialiased: bool,
     /// Lights the colours.
-    pub lamp: Option<Lamp>,
+    pub lamp: Option<ReferenceLamp>,
 }
 
 /// Projects one Gaussian; `None` if it is culled.
 pub fn project_gaussian(
-    camera: &Camera,
+    camera: &ReferenceCamera,
     settings: ProjectionSettings,
     gaussian: &Gaussian,
 ) -> Option<Projection> {
@@ -140,8 +140,8 @@ struct ProjectionInputs<'a> {
     constants: &'a Constants,
     /// Size of the image, pixels.
     size: UVec2,
-    camera: Camera,
-    lamp: Option<Lamp>,
+    camera: ReferenceCamera,
+    lamp: Option<ReferenceLamp>,
     planes: Planes,
 }
 
@@ -153,15 +153,15 @@ impl<'a> ProjectionInputs<'a> {
         lamp: &[f32],
     ) -> Self {
         let Constants { channels, sh_degree, view_depths, .. } = *constants;
-        let planes = Planes::of(
+        let planes = Planes::new(
             params.gaussian_count,
             channels - view_depths,
             sh_degree,
             constants.rest_by_column,
         );
         let camera = &cameras[params.camera_index as usize];
-        let (size, camera) = (camera.size, Camera::from(camera));
-        let lamp = constants.lamp.then(|| Lamp::of(lamp));
+        let (size, camera) = (camera.size, ReferenceCamera::from(camera));
+        let lamp = constants.lamp.then(|| ReferenceLamp::from_numbers(lamp));
         Self { params, constants, size, camera, lamp, planes }
     }
 
@@ -221,7 +221,7 @@ impl<'a> ProjectionInputs<'a> {
         // Sixteen terms, whose basis is a polynomial of magnitude 3 and degree 3.
         let color = 128.0 * (1.0 + gaussian.sh.iter().map(|c| c.abs().max_element()).sum::<f64>());
         let point = self.camera.view(gaussian.mean);
-        let lit = |lamp: Lamp| {
+        let lit = |lamp: ReferenceLamp| {
             let relative = 1.0 + lamp.factor_error(point) / UNIT;
             lamp.steepness() * lamp.factor(point) * relative * color
         };

@@ -2,9 +2,9 @@
 
 use glam::{DMat3, DVec2, DVec3, DVec4, UVec2};
 
-use super::camera::Camera;
+use super::camera::ReferenceCamera;
 use super::gaussian::{Gaussian, Planes, sigmoid};
-use super::lamp::Lamp;
+use super::lamp::ReferenceLamp;
 use super::rotation::{rotation, unit_quat};
 use super::rounding::{Rounded, UNIT, chain, sensitivity};
 use super::sh::{sh_basis, sh_basis_gradient};
@@ -37,7 +37,7 @@ pub struct DSplat {
 #[derive(Clone, Copy, Debug)]
 pub struct Lit {
     /// The lamp.
-    pub lamp: Lamp,
+    pub lamp: ReferenceLamp,
     /// RGB, lit.
     pub color: DVec3,
 }
@@ -52,7 +52,7 @@ pub fn splat_gradient(splat: &Splat, record: &[f64]) -> (DVec2, DVec3, f64) {
 
 /// The gradients of a Gaussian's attributes from those of its splat.
 pub fn project_gaussian_backward(
-    camera: &Camera,
+    camera: &ReferenceCamera,
     sh_degree: u32,
     antialiased: bool,
     gaussian: &Gaussian,
@@ -162,15 +162,15 @@ fn outer_product(column: DVec3, row: DVec3) -> DMat3 {
 const HEAD: usize = RECORD_HEAD as usize;
 
 /// A view and its Gaussians.
-struct ProjectionInputs<'a> {
+struct BackwardInputs<'a> {
     params: &'a Params,
     constants: &'a Constants,
-    camera: Camera,
-    lamp: Option<Lamp>,
+    camera: ReferenceCamera,
+    lamp: Option<ReferenceLamp>,
     planes: Planes,
 }
 
-impl<'a> ProjectionInputs<'a> {
+impl<'a> BackwardInputs<'a> {
     fn new(
         params: &'a Params,
         constants: &'a Constants,
@@ -179,9 +179,9 @@ impl<'a> ProjectionInputs<'a> {
     ) -> Self {
         let Constants { channels, sh_degree, .. } = *constants;
         let planes =
-            Planes::of(params.gaussian_count, channels, sh_degree, constants.rest_by_column);
-        let camera = Camera::from(&cameras[params.camera_index as usize]);
-        let lamp = constants.lamp.then(|| Lamp::of(lamp));
+            Planes::new(params.gaussian_count, channels, sh_degree, constants.rest_by_column);
+        let camera = ReferenceCamera::from(&cameras[params.camera_index as usize]);
+        let lamp = constants.lamp.then(|| ReferenceLamp::from_numbers(lamp));
         Self { params, constants, camera, lamp, planes }
     }
 
@@ -314,7 +314,7 @@ impl Reference for Kernel {
         let Slices { status, gradients, grad_norm_sums, visit_counts, .. } = slices;
         // From before the pass, since the device may process Gaussians in any order.
         let before = status[3];
-        let scene = ProjectionInputs::new(params, constants, slices.cameras, slices.lamp);
+        let scene = BackwardInputs::new(params, constants, slices.cameras, slices.lamp);
         let (planes, parameters) = scene.planes.floats(slices.parameters, constants.half_rest);
         let written = scene.written_columns() * scene.planes.count;
         let frozen = constants.frozen_columns as usize * scene.planes.count;
@@ -350,7 +350,7 @@ impl Reference for Kernel {
     /// Attributes also pass through sums and exponentials with terms of order one, means through the view.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         const OFF: f64 = 256.0 * UNIT;
-        let scene = ProjectionInputs::new(params, constants, slices.cameras, slices.lamp);
+        let scene = BackwardInputs::new(params, constants, slices.cameras, slices.lamp);
         let (planes, parameters) = scene.planes.floats(slices.parameters, constants.half_rest);
         let one = Planes { count: 1, ..planes };
         let far = scene.camera.center().length();

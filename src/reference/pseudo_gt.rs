@@ -22,7 +22,7 @@ fn stored(code_bits: u32, slices: &Slices<'_>, i: usize) -> f32 {
 fn mixed(curve: u32, rgb: [f32; 3], tone: &ToneParameters) -> [Rounded; 3] {
     let rgb = rgb.map(|x| Rounded::exact(measurable(x)));
     let [white, offset, gain] = [tone.white, tone.offset, tone.gain].map(Rounded::exact);
-    let (one, of) = (Rounded::of(1.0), Rounded::of);
+    let (one, of) = (Rounded::from_f64(1.0), Rounded::from_f64);
     let y = of(0.299) * rgb[0] + of(0.587) * rgb[1] + of(0.114) * rgb[2];
     let channel = |channel: usize| match curve {
         CURVE_AUTO => {
@@ -41,7 +41,7 @@ fn mixed(curve: u32, rgb: [f32; 3], tone: &ToneParameters) -> [Rounded; 3] {
 fn tabled(knots: &[Rounded], count: usize, channel: usize, x: Rounded) -> Rounded {
     let (knots, _) = knots.as_chunks::<3>();
     let y = interpolate(&knots[channel * count..][..count], x);
-    y.at_least(Rounded::of(0.0)).at_most(Rounded::of(1.0))
+    y.at_least(Rounded::from_f64(0.0)).at_most(Rounded::from_f64(1.0))
 }
 
 /// A pixel under the whole curve.

@@ -118,7 +118,7 @@ impl Rounded {
 pub(super) fn rounded_tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> Rounded {
     let [x, white, offset, gain] = [x, tone.white, tone.offset, tone.gain].map(Rounded::exact);
     let y = curve_at(curve, x / white, [offset, gain], &tone.constants.map(Rounded::exact));
-    y.at_least(Rounded::of(0.0)).at_most(Rounded::of(1.0))
+    y.at_least(Rounded::from_f64(0.0)).at_most(Rounded::from_f64(1.0))
 }
 
 /// Writes the values to the start of a buffer of floats or of groups of floats.
@@ -252,7 +252,7 @@ impl Gated for Rounded {
 }
 
 impl Real for Rounded {
-    fn of(x: f64) -> Self {
+    fn from_f64(x: f64) -> Self {
         Self { value: x, error: (f64::from(x as f32) - x).abs() }
     }
 
@@ -281,7 +281,7 @@ impl Real for Rounded {
             let argument = Self::from_argument(self.value.ln_1p(), self.error, 1.0);
             return argument.rounded(8.0);
         }
-        (Self::of(1.0) + self).ln()
+        (Self::from_f64(1.0) + self).ln()
     }
 
     /// exp2(p log2(x)).
@@ -329,7 +329,8 @@ mod tests {
     /// A formula with every operation, in any number type.
     fn formula<T: Real>(x: T, y: T) -> T {
         let root = (x * x + y * y).sqrt();
-        (x - y) / (T::of(0.3) + root) + (-root).exp() * root.one_minus_exp() - x.power(y).ln_1p()
+        (x - y) / (T::from_f64(0.3) + root) + (-root).exp() * root.one_minus_exp()
+            - x.power(y).ln_1p()
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use glam::{DVec2, DVec3};
 
-use super::camera::Camera;
+use super::camera::ReferenceCamera;
 use super::rounding::UNIT;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::smoothing_floor::{Constants, Kernel, Params, SEEN_MARGIN, Slices, Tolerances};
@@ -12,7 +12,7 @@ use crate::splats::attributes::Attribute;
 /// does.
 fn sampling(params: &Params, slices: &Slices<'_>, mean: DVec3, margin: f64) -> Option<f64> {
     let of_view = |camera: &_| {
-        let camera = Camera::from(camera);
+        let camera = ReferenceCamera::from(camera);
         let point = camera.view(mean);
         let depth = camera.depth(point);
         let is_ahead = depth > params.near.into();
@@ -51,7 +51,9 @@ impl Reference for Kernel {
         let n = params.gaussian_count as usize;
         let mut parameters = vec![0.0; slices.parameters.len()];
         let cameras = slices.cameras.iter().take(params.camera_count as usize);
-        let far = cameras.map(|camera| Camera::from(camera).center().length()).fold(0.0, f64::max);
+        let far = cameras
+            .map(|camera| ReferenceCamera::from(camera).center().length())
+            .fold(0.0, f64::max);
         for i in 0..n {
             let mean = mean(params, &slices, i);
             let of = |margin| sampling(params, &slices, mean, margin);

@@ -11,7 +11,7 @@ use crate::photographs::tone::Real;
 
 /// SSIM at one pixel of one channel and its derivatives with respect to the blurred moments.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Ssim<T> {
+pub(super) struct SsimPixel<T> {
     /// The index itself, at most 1.
     pub(super) value: T,
     /// dS/dE\[a\], dS/dE\[aa\], dS/dE\[ab\].
@@ -50,20 +50,20 @@ pub fn ssim(size: [usize; 2], a: &[f64], b: &[f64]) -> Vec<f64> {
 /// Numbers in double precision.
 #[cfg(feature = "testing")]
 fn double(plane: &[f64]) -> Vec<Rounded> {
-    plane.iter().map(|&x| Rounded::of(x)).collect()
+    plane.iter().map(|&x| Rounded::from_f64(x)).collect()
 }
 
-fn ssim_of_moments<T: Real>(a: T, b: T, aa: T, bb: T, ab: T) -> Ssim<T> {
-    let [one, two, c1, c2] = [1.0, 2.0, C1, C2].map(T::of);
+fn ssim_of_moments<T: Real>(a: T, b: T, aa: T, bb: T, ab: T) -> SsimPixel<T> {
+    let [one, two, c1, c2] = [1.0, 2.0, C1, C2].map(T::from_f64);
     let a1 = two * a * b + c1;
     let a2 = two * (ab - a * b) + c2;
     let b1 = a * a + b * b + c1;
     // Variances are not negative: only cancellation of large bright values reaches the floor.
-    let b2 = (aa - a * a + bb - b * b).at_least(T::of(0.0)) + c2;
+    let b2 = (aa - a * a + bb - b * b).at_least(T::from_f64(0.0)) + c2;
     let scale = one / (b1 * b2);
     let value = a1 * a2 * scale;
     let d_mean = two * (b * (a2 - a1) * scale - a * value * (one / b1 - one / b2));
-    Ssim { value, d_moments: [d_mean, -value / b2, two * a1 * scale] }
+    SsimPixel { value, d_moments: [d_mean, -value / b2, two * a1 * scale] }
 }
 
 /// The gradient of `l1_scale` sum|a - b| - `ssim_scale` sum SSIM with respect to one channel of the render `a`, sums
@@ -76,14 +76,14 @@ pub fn gradient(
     a: &[f64],
     b: &[f64],
 ) -> Vec<f64> {
-    let (scales, [a, b]) = (scales.map(Rounded::of), [a, b].map(double));
+    let (scales, [a, b]) = (scales.map(Rounded::from_f64), [a, b].map(double));
     let outcomes = outcomes_of_channel(size, loss_region, scales, &a, &b);
     outcomes.iter().map(|of| of.gradient.value).collect()
 }
 
 /// dSSIM/da at one pixel, from the blurred derivatives. A value outside all windows has no gradient, even if it is NaN.
 fn d_ssim<T: Real>(a: T, b: T, [mean, square, product]: [T; 3]) -> T {
-    let of_square = if square == T::of(0.0) { square } else { T::of(2.0) * a * square };
+    let of_square = if square == T::from_f64(0.0) { square } else { T::from_f64(2.0) * a * square };
     mean + of_square + b * product
 }
 
@@ -97,7 +97,7 @@ pub(super) fn rounded_gradient(
 ) -> [Rounded; 2] {
     let difference = if counts { a - b } else { Rounded::default() };
     let value = difference.value;
-    let sign = Rounded::of(if value == 0.0 { 0.0 } else { value.signum() });
+    let sign = Rounded::from_f64(if value == 0.0 { 0.0 } else { value.signum() });
     let gradient = l1_scale * sign - ssim_scale * d_ssim(a, b, d_moments);
     [gradient, difference.abs()]
 }
@@ -112,14 +112,14 @@ pub(super) fn rounded_blur(size: [usize; 2], plane: &[Rounded]) -> Vec<Rounded> 
 }
 
 /// The results of the kernel for a value of the render.
-struct Outcome {
+struct SsimGradient {
     gradient: Rounded,
     /// a - b and SSIM; zero outside the loss region.
     difference: Rounded,
     ssim: Rounded,
 }
 
-fn outcomes(params: &Params, slices: &Slices<'_>) -> Vec<Outcome> {
+fn outcomes(params: &Params, slices: &Slices<'_>) -> Vec<SsimGradient> {
     let size = [params.width as usize, params.height as usize];
     let scales = [params.l1_scale, params.ssim_scale].map(Rounded::exact);
     let pixels = size[0] * size[1];
@@ -138,7 +138,7 @@ pub(super) fn rounded_ssim(
     a: &[Rounded],
     b: &[Rounded],
     counts: impl Fn(usize) -> bool,
-) -> Vec<Ssim<Rounded>> {
+) -> Vec<SsimPixel<Rounded>> {
     let moment = |of: fn(Rounded, Rounded) -> Rounded| {
         let plane: Vec<_> = a.iter().zip(b).map(|(&a, &b)| of(a, b)).collect();
         rounded_blur(size, &plane)
@@ -148,7 +148,7 @@ pub(super) fn rounded_ssim(
     let index = |i: usize| {
         let ([a, b], [aa, bb, ab]) =
             ([0, 1].map(|m| means[m][i]), [0, 1, 2].map(|m| squares[m][i]));
-        if counts(i) { ssim_of_moments(a, b, aa, bb, ab) } else { Ssim::default() }
+        if counts(i) { ssim_of_moments(a, b, aa, bb, ab) } else { SsimPixel::default() }
     };
     (0..a.len()).map(index).collect()
 }
@@ -159,7 +159,7 @@ fn outcomes_of_channel(
     scales: [Rounded; 2],
     a: &[Rounded],
     b: &[Rounded],
-) -> Vec<Outcome> {
+) -> Vec<SsimGradient> {
     let counts = |i: usize| inside(i, size.map(|side| side as u32), loss_region);
     let map = rounded_ssim(size, a, b, counts);
     let derivatives = [0, 1, 2]
@@ -167,19 +167,19 @@ fn outcomes_of_channel(
     let outcome = |i: usize| {
         let d = [0, 1, 2].map(|m| derivatives[m][i]);
         let [gradient, difference] = rounded_gradient(scales, a[i], b[i], d, counts(i));
-        Outcome { gradient, difference, ssim: map[i].value }
+        SsimGradient { gradient, difference, ssim: map[i].value }
     };
     (0..a.len()).map(outcome).collect()
 }
 
 /// The gradients, added to those of earlier terms if they are accumulated.
 fn accumulated<'a>(
-    outcomes: &'a [Outcome],
+    outcomes: &'a [SsimGradient],
     constants: &Constants,
     before: &'a [f32],
 ) -> impl Iterator<Item = Rounded> + 'a {
     let adds = constants.adds;
-    let sum = move |(of, &before): (&Outcome, &f32)| {
+    let sum = move |(of, &before): (&SsimGradient, &f32)| {
         if adds { Rounded::exact(before) + of.gradient } else { of.gradient }
     };
     outcomes.iter().zip(before).map(sum)

@@ -2,11 +2,11 @@
 
 use super::inside;
 use super::rounding::{Rounded, chain, sum_tolerance, write, write_sum};
-use super::ssim::{Ssim, rounded_ssim};
+use super::ssim::{SsimPixel, rounded_ssim};
 use crate::gpu::Reference;
 use crate::kernels::ssim_forward::{Constants, Kernel, Params, Slices, Tolerances};
 
-fn indices(params: &Params, slices: &Slices<'_>) -> Vec<Ssim<Rounded>> {
+fn indices(params: &Params, slices: &Slices<'_>) -> Vec<SsimPixel<Rounded>> {
     let size = [params.width as usize, params.height as usize];
     let counts = |i| inside(i, [params.width, params.height], [params.loss_begin, params.loss_end]);
     let pixels = size[0] * size[1];

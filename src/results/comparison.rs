@@ -6,9 +6,9 @@ use serde_json::{Value, json};
 
 use super::eval::{After, Evaluation, Extras, Metric, ScoreReference, ScoredImages};
 use super::finished_run::{FinishedRun, Opener, is_model};
-use super::report::{Best, Column, Comparison, Facts, Picture, Report, Table};
+use super::report::{Best, Column, Comparison, NumberTable, Picture, Report, TextTable};
 use super::run;
-use crate::networks::lpips::{Lpips, Measure, Range};
+use crate::networks::lpips::{Lpips, LpipsVersion, Range};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::photographs::metrics::Scores;
@@ -37,7 +37,7 @@ struct Compared {
 #[derive(Debug)]
 pub(crate) struct RunComparison {
     runs: Vec<Compared>,
-    measure: Option<Measure>,
+    measure: Option<LpipsVersion>,
     pictures: Vec<Comparison>,
 }
 
@@ -54,7 +54,7 @@ pub(crate) struct CompareOptions<'a> {
 impl RunComparison {
     /// Scores the test views of every run against the same images: the references or, without any, the targets of the
     /// first run.
-    pub(crate) fn of(paths: &[PathBuf], options: &CompareOptions<'_>) -> Result<Self> {
+    pub(crate) fn new(paths: &[PathBuf], options: &CompareOptions<'_>) -> Result<Self> {
         let names = names(paths);
         let mut first: Option<(Dataset, ScoreReference)> = None;
         let mut comparison = Self { runs: vec![], measure: None, pictures: vec![] };
@@ -62,11 +62,11 @@ impl RunComparison {
             let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, .. } =
                 FinishedRun::open_lit(path, options.dataset, &options.opener)?;
             if first.is_none() {
-                let reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
+                let reference = ScoreReference::new(&gpu, &config.tone, &dataset)?;
                 first = Some((dataset.clone(), reference));
             }
-            let Some((known, reference)) = &mut first else { continue };
-            if let Some(difference) = difference(known, &dataset) {
+            let Some((first_dataset, reference)) = &mut first else { continue };
+            if let Some(difference) = difference(first_dataset, &dataset) {
                 let problem = format!(
                     "{} and {name} are runs of different datasets: {difference}; compare runs of one",
                     paths[0].display()
@@ -104,7 +104,7 @@ impl RunComparison {
     }
 
     /// The runs with their mean scores.
-    pub(crate) fn means(&self) -> Table {
+    pub(crate) fn means(&self) -> NumberTable {
         let column = |name: &str, digits, best| Column { name: name.to_owned(), digits, best };
         let mut columns = vec![
             column("PSNR, dB", 2, Best::Greatest),
@@ -129,7 +129,7 @@ impl RunComparison {
             ]);
             (run.name.clone(), values)
         };
-        Table {
+        NumberTable {
             title: "Means over the test views".to_owned(),
             label: "run".to_owned(),
             columns,
@@ -138,8 +138,8 @@ impl RunComparison {
     }
 
     /// The PSNR of each test view in the first run, and how much higher it is in the others.
-    pub(crate) fn views(&self) -> Table {
-        let Some((first, others)) = self.runs.split_first() else { return Table::default() };
+    pub(crate) fn views(&self) -> NumberTable {
+        let Some((first, others)) = self.runs.split_first() else { return NumberTable::default() };
         let column = |name: String, best| Column { name, digits: 2, best };
         let mut columns = vec![column(format!("PSNR of {}, dB", first.name), Best::Unmarked)];
         let gains = others.iter().map(|run| column(format!("{} gains", run.name), Best::Unmarked));
@@ -153,7 +153,7 @@ impl RunComparison {
             let values = std::iter::once(of_first).chain(others.iter().map(gain));
             (view.to_owned(), values.collect())
         };
-        Table {
+        NumberTable {
             title: "Test views".to_owned(),
             label: "view".to_owned(),
             columns,
@@ -203,7 +203,7 @@ impl RunComparison {
     pub(crate) fn html(&self) -> String {
         let names: Vec<&str> = self.runs.iter().map(|run| run.name.as_str()).collect();
         let settings = self.settings();
-        let facts = (!settings.is_empty()).then(|| Facts {
+        let facts = (!settings.is_empty()).then(|| TextTable {
             title: format!("Settings that differ: {}", names.join(" | ")),
             rows: settings,
         });

@@ -6,10 +6,10 @@ use crate::photographs::targets::SceneTone;
 use crate::photographs::tone::{ToneSettings, luminance};
 use crate::results::linear_light::target_of;
 use crate::results::report::{
-    Best, Column, Comparison, Distribution, Facts, Picture, Report, Table, distributions,
+    Best, Column, Comparison, Distribution, NumberTable, Picture, Report, TextTable, distributions,
 };
 use crate::train::diagnose::{
-    Diagnosis, LampDiagnosis, Noise, Plan, SceneDiagnosis, TargetNoise, ViewDiagnosis,
+    ChannelNoise, Diagnosis, LampDiagnosis, Plan, SceneDiagnosis, TargetNoise, ViewDiagnosis,
 };
 
 /// Width of an image, pixels.
@@ -69,14 +69,14 @@ const MEASURES: [Measure; 14] = [
 ];
 
 /// The table of photographs.
-pub(crate) fn table(diagnosis: &Diagnosis) -> Table {
+pub(crate) fn table(diagnosis: &Diagnosis) -> NumberTable {
     let column = |(name, digits, ..): &Measure| Column {
         name: (*name).to_owned(),
         digits: *digits,
         best: Best::Unmarked,
     };
     let row = |view: &ViewDiagnosis| (view.name.clone(), values(view).to_vec());
-    Table {
+    NumberTable {
         title: "Training photographs".to_owned(),
         label: "view".to_owned(),
         columns: MEASURES.iter().map(column).collect(),
@@ -117,7 +117,7 @@ pub(crate) fn sizes(views: &[ViewDiagnosis]) -> String {
 /// Measurements of the whole set: a name and values in each row.
 pub(crate) fn scene_facts(scene: &SceneDiagnosis) -> [[String; 2]; 6] {
     let sensor = match scene.noise {
-        Some(Noise { gain, read }) => {
+        Some(ChannelNoise { gain, read }) => {
             format!("sensor: gain {gain:.2e}, read noise {read:.2e} of white, linear")
         }
         None => "sensor: not measurable, no photograph has a flat, unclipped area".to_owned(),
@@ -221,7 +221,7 @@ pub(crate) fn page(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
     let decided = decided.map(|(part, value, why)| [format!("{part}: {value}"), why.to_owned()]);
     let meaning =
         |(name, _, meaning, bad): &Measure| [(*name).to_owned(), format!("{meaning}. Bad: {bad}.")];
-    let facts = |title: &str, rows| Facts { title: title.to_owned(), rows };
+    let facts = |title: &str, rows| TextTable { title: title.to_owned(), rows };
     Report {
         title: format!("Diagnosis of {}", dataset.root.display()),
         intro,
@@ -255,8 +255,8 @@ fn histogram(of: [&Image; 2], width: u32, height: u32) -> Image {
     let heights = of.map(|image| {
         let mut counts = vec![0.0_f64; width as usize];
         for (x, y) in (0..image.height).flat_map(|y| (0..image.width).map(move |x| (x, y))) {
-            let place = luminance(image.pixel(x, y)).clamp(0.0, 1.0) * (width - 1) as f32;
-            counts[place.round() as usize] += 1.0;
+            let position = luminance(image.pixel(x, y)).clamp(0.0, 1.0) * (width - 1) as f32;
+            counts[position.round() as usize] += 1.0;
         }
         let peak = counts.iter().fold(1.0, |peak: f64, &count| peak.max(count));
         counts.iter().map(|count| count / peak * f64::from(height)).collect::<Vec<_>>()

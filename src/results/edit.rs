@@ -18,19 +18,19 @@ use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 
-use self::capture::Capture;
+use self::capture::ModelPhotographs;
 use self::content::Content;
 use self::evidence::Measured;
 use self::floaters::{CameraPositions, Floaters};
 use self::placement::Placement;
 use self::step::Step;
 use crate::base::output::{check_writable, is_same_file, write_whole};
-use crate::base::ply::Header;
+use crate::base::ply::PlyHeader;
 use crate::camera::enclosing_sphere;
 use crate::results::export::{EDITS, Format, Provenance};
 use crate::results::finished_run::{Opener, is_model};
 use crate::results::{models, run};
-use crate::splats::scene::{Facts, Features, Gaussians, Shape, is_far};
+use crate::splats::scene::{Features, Gaussians, ModelFacts, Shape, is_far};
 use crate::{Error, Result};
 
 pub(crate) use operation::{EditList, Operation, Region, Scale, fingerprint};
@@ -43,12 +43,12 @@ pub(crate) struct Editor {
     dataset: Option<PathBuf>,
     opener: Opener,
     content: Content,
-    facts: Facts,
+    facts: ModelFacts,
     /// Identifies the model as it was opened.
     fingerprint: String,
     placement: Placement,
     /// Opened by the first operation that needs it.
-    capture: Option<Capture>,
+    capture: Option<ModelPhotographs>,
     /// The operations so far, with numbers in place of what they were measured from.
     done: Vec<Operation>,
     /// The edit lists in the header of the file.
@@ -75,7 +75,7 @@ impl Editor {
 
     /// Refuses an output that is the model itself, has no extension of a model, or cannot be written.
     pub(crate) fn check_output(model: &Path, out: &Path) -> Result<()> {
-        Format::of(out)?;
+        Format::from_path(out)?;
         if is_same_file(out, model) || is_same_file(out, &model.join("model.ply")) {
             return Err(Error::output(out, "is the model itself; name another file with --out"));
         }
@@ -87,10 +87,10 @@ impl Editor {
         if list.model == self.fingerprint {
             return Ok(());
         }
-        let (own, other) = (&self.fingerprint, &list.model);
+        let (ours, other) = (&self.fingerprint, &list.model);
         let model = self.path.display();
         let problem = format!(
-            "is an edit list of another model, {other}; {model} is {own}: apply it to its own, or change `model`"
+            "is an edit list of another model, {other}; {model} is {ours}: apply it to its own, or change `model`"
         );
         Err(Error::input(path, problem))
     }
@@ -168,7 +168,7 @@ impl Editor {
         edits.push(self.list().line());
         let facts = self.facts;
         let provenance = Provenance { dataset, curve, facts, edits, ..Provenance::default() };
-        match Format::of(out)? {
+        match Format::from_path(out)? {
             Format::Ply => self.content.save_ply(&provenance, out)?,
             format => format.write(&*self.content.whole()?, &provenance, out)?,
         }
@@ -187,10 +187,10 @@ impl Editor {
         write_whole(out, list.text().as_bytes())
     }
 
-    fn open_capture(&mut self) -> Result<&mut Capture> {
+    fn open_capture(&mut self) -> Result<&mut ModelPhotographs> {
         if self.capture.is_none() {
             let dataset = self.dataset.as_deref();
-            self.capture = Some(Capture::open(&self.path, dataset, &self.opener)?);
+            self.capture = Some(ModelPhotographs::open(&self.path, dataset, &self.opener)?);
         }
         self.capture
             .as_mut()
@@ -330,12 +330,12 @@ impl Editor {
         if let Some(stated) = hash.filter(|stated| *stated != fingerprint) {
             return refused(format!("is model {fingerprint}, not {stated} as the edit list says"));
         }
-        let look = |facts: &Facts| {
+        let appearance = |facts: &ModelFacts| {
             let defaults = crate::splats::render::RenderSettings::default();
             let raw_colors = facts.raw_colors.unwrap_or(defaults.raw_colors);
             (raw_colors, facts.max_alpha.unwrap_or(defaults.max_alpha), facts.antialiased)
         };
-        if look(&facts) != look(&self.facts) {
+        if appearance(&facts) != appearance(&self.facts) {
             let problem = "renders with other colours, alpha limit or antialiasing than the model; train both alike";
             return refused(problem.to_owned());
         }
@@ -378,7 +378,7 @@ fn earlier_edits(path: &Path) -> Vec<String> {
     let path = if path.is_dir() { path.join("model.ply") } else { path.to_owned() };
     let mut bytes = vec![];
     let read = File::open(path).and_then(|file| file.take(LONGEST).read_to_end(&mut bytes));
-    let header = read.ok().and_then(|_| Header::parse(&bytes).ok());
+    let header = read.ok().and_then(|_| PlyHeader::parse(&bytes).ok());
     let comments = header.into_iter().flat_map(|header| header.comments);
     let list = |(_, comment): (usize, String)| {
         Some(comment.strip_prefix(EDITS)?.strip_prefix(": ")?.to_owned())

@@ -89,11 +89,11 @@ pub struct ScoreReference {
 impl ScoreReference {
     /// The reference images of the test views that have one; without any, the targets that `tone apply` gives the test
     /// views, with the statistics of the training photographs.
-    pub fn of(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
+    pub fn new(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
         Self::made_by(tone, dataset, || Targets::new(gpu, tone, dataset))
     }
 
-    /// [`ScoreReference::of`] with given statistics of the training photographs.
+    /// [`ScoreReference::new`] with given statistics of the training photographs.
     pub fn in_scene(gpu: &Gpu, dataset: &Dataset, scene: &SceneTone) -> Result<Self> {
         Self::made_by(scene.settings(), dataset, || Targets::in_scene(gpu, scene.clone()))
     }
@@ -108,7 +108,7 @@ impl ScoreReference {
         Ok(Self { against, targets, made: BTreeMap::new() })
     }
 
-    /// The kind that [`ScoreReference::of`] chooses.
+    /// The kind that [`ScoreReference::new`] chooses.
     pub fn kind(tone: &ToneSettings, dataset: &Dataset) -> ReferenceKind {
         let has_references = dataset.test_views().any(View::has_reference);
         let has_photographs = dataset.test_views().any(View::has_photograph);
@@ -373,7 +373,8 @@ impl Evaluation {
         if let Some((lpips, gpu)) = extras.lpips {
             values.push((Metric::Lpips, images.lpips(gpu, lpips)?));
         }
-        if let Some(ResidualTransmittance { mean, q99 }) = ResidualTransmittance::of(rendered, view)
+        if let Some(ResidualTransmittance { mean, q99 }) =
+            ResidualTransmittance::measure(rendered, view)
         {
             values.push((Metric::ResidualTransmittance, mean));
             values.push((Metric::ResidualTransmittanceQ99, q99));
@@ -408,7 +409,7 @@ pub fn score(
 /// The scores after the gain and bias of each channel that minimise the squared error to the target.
 fn aligned(render: &Image, target: &Image) -> Result<Scores> {
     let affine = Affine::least_squares(render, target)?;
-    Scores::of(&quantized(&affine.applied(render)), target)
+    Scores::measure(&quantized(&affine.applied(render)), target)
 }
 
 /// Clamps to [0, 1] and rounds to multiples of 1/255. A NaN becomes 0.

@@ -81,7 +81,7 @@ impl RunEvaluation {
             scene: scene.transpose()?,
             stops: known_stops(&dataset, &config)?,
         };
-        let mut reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
+        let mut reference = ScoreReference::new(&gpu, &config.tone, &dataset)?;
         let (count, mut index) = (reference.view_count(&dataset), 0);
         let is_even = reference.is_evenly_lit(&dataset);
         let render = |view: &View| {

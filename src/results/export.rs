@@ -20,7 +20,7 @@ use glam::{DMat3, DQuat, DVec3, Vec3};
 
 use crate::base::output::write_whole;
 use crate::splats::model::Model;
-use crate::splats::scene::{Facts, Gaussians, ply};
+use crate::splats::scene::{Gaussians, ModelFacts, ply};
 use crate::{Error, Result};
 
 /// The formats of a model.
@@ -67,7 +67,7 @@ impl Format {
     ///
     /// # Errors
     /// [`Error::Usage`] for any other extension.
-    pub fn of(path: &Path) -> Result<Self> {
+    pub fn from_path(path: &Path) -> Result<Self> {
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
         let is_file = |format: &Self| !matches!(format, Self::StreamedSog | Self::Html);
         let mut files = Self::ALL.into_iter().filter(is_file);
@@ -90,7 +90,7 @@ impl Format {
                 return ply::save_with_comments(gaussians, path, &comments);
             }
             Self::StreamedSog => {
-                let tile = streamed::Tile::whole(path, gaussians);
+                let tile = streamed::TileLoader::whole(path, gaussians);
                 let division = streamed::Division::default();
                 return streamed::write(path, &[tile], provenance, division).map(drop);
             }
@@ -125,7 +125,7 @@ impl Model {
     /// As [`Gaussians::save`].
     pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();
-        self.save_as(path, Format::of(path)?)
+        self.save_as(path, Format::from_path(path)?)
     }
 
     /// Writes the model in a format, regardless of the file's extension.
@@ -146,7 +146,7 @@ impl Gaussians {
     /// left.
     pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();
-        self.save_as(path, Format::of(path)?)
+        self.save_as(path, Format::from_path(path)?)
     }
 
     /// Writes the model in a format, regardless of the file's extension.
@@ -170,7 +170,7 @@ pub struct Provenance {
     /// The rotation that was applied by [`Gaussians::rotated`].
     pub rotation: DQuat,
     /// Settings that a renderer requires; the origin is that of the Gaussians.
-    pub facts: Facts,
+    pub facts: ModelFacts,
     /// The edit lists that were applied, each on one line.
     pub edits: Vec<String>,
 }
@@ -212,8 +212,8 @@ impl Provenance {
     }
 
     /// The facts for a file of `gaussians`, with their origin.
-    fn facts_of(&self, gaussians: &Gaussians) -> Facts {
-        Facts { origin: gaussians.origin, ..self.facts }
+    fn facts_of(&self, gaussians: &Gaussians) -> ModelFacts {
+        ModelFacts { origin: gaussians.origin, ..self.facts }
     }
 
     /// A header line that maps the file's positions to the dataset's world, if they differ. `half_turned`: the file's

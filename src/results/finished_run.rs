@@ -10,7 +10,7 @@ use crate::results::eval::ModelRenderer;
 use crate::results::{models, run};
 use crate::splats::lamp::Lamp;
 use crate::splats::model::Model;
-use crate::splats::scene::{Facts, Gaussians};
+use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
@@ -127,7 +127,7 @@ impl FinishedRun {
         config.frame = Some(frame);
         // The default is relative to the extent of the scene.
         let near = facts.near.or(config.facts(&frame).near);
-        let model = Model::of_shown(gaussians, &Facts { near, ..facts });
+        let model = Model::of_shown(gaussians, &ModelFacts { near, ..facts });
         let model_renderer = ModelRenderer::new(&gpu, &model, &config, None)?;
         let gaussian_count = model.gaussians.count;
         Ok(Self { gpu, config, dataset, gaussian_count, model_renderer, lamp: None })
@@ -141,14 +141,14 @@ pub(crate) fn needs_photographs(path: &Path) -> Error {
 
 /// Whether a path names a model file instead of a run.
 pub(crate) fn is_model(path: &Path) -> bool {
-    let is_named = |name: &OsStr| ["ply", "spz", "sog"].iter().any(|known| name == *known);
+    let is_named = |name: &OsStr| ["ply", "spz", "sog"].iter().any(|extension| name == *extension);
     path.is_file() || (!path.is_dir() && path.extension().is_some_and(is_named))
 }
 
 /// The settings to render a model file with: the defaults, except for those that it states.
 pub(crate) fn config_of_file(
     gaussians: &Gaussians,
-    facts: &Facts,
+    facts: &ModelFacts,
     dataset: Option<&Path>,
 ) -> TrainConfig {
     let mut config = TrainConfig {

@@ -16,7 +16,9 @@ pub(crate) fn photograph_of(target: &Image, inverse: &InverseTone) -> (Image, us
     let pixels = target.pixel_count();
     let inverted: Vec<Inverted> = (0..pixels)
         .into_par_iter()
-        .map(|pixel| inverse.of([0, 1, 2].map(|plane| target.data[plane * pixels + pixel].into())))
+        .map(|pixel| {
+            inverse.invert([0, 1, 2].map(|plane| target.data[plane * pixels + pixel].into()))
+        })
         .collect();
     let plane = |plane: usize| inverted.iter().map(move |pixel| pixel.rgb[plane] as f32);
     let data = (0..3).flat_map(plane).collect();
@@ -39,7 +41,8 @@ pub(crate) fn slope_at(target: &Image, inverse: &InverseTone) -> f64 {
     let pixels = target.pixel_count();
     let squares = |pixel: usize| {
         let value = [0, 1, 2].map(|plane| f64::from(target.data[plane * pixels + pixel]));
-        let [below, above] = [-STEP, STEP].map(|step| inverse.of(value.map(|value| value + step)));
+        let [below, above] =
+            [-STEP, STEP].map(|step| inverse.invert(value.map(|value| value + step)));
         let rise = |c: usize| ((above.rgb[c] - below.rgb[c]) / (2.0 * STEP)).powi(2);
         (!above.is_clipped).then(|| rise(0) + rise(1) + rise(2))
     };
@@ -63,14 +66,17 @@ pub(crate) fn linear_gaussians(
     let directions: Vec<([f64; 16], f64)> =
         quadrature().map(|(direction, weight)| (sh_basis(degree, direction), weight)).collect();
     let converted = |i: usize| {
-        let own = &gaussians.rest()[rest * i..][..rest];
-        let own: Vec<DVec3> =
-            std::iter::once(&gaussians.dc()[i]).chain(own).map(|value| value.as_dvec3()).collect();
-        let mut fitted = vec![DVec3::ZERO; own.len()];
+        let coefficients = &gaussians.rest()[rest * i..][..rest];
+        let coefficients: Vec<DVec3> = std::iter::once(&gaussians.dc()[i])
+            .chain(coefficients)
+            .map(|value| value.as_dvec3())
+            .collect();
+        let mut fitted = vec![DVec3::ZERO; coefficients.len()];
         let mut is_clipped = false;
         for (basis, weight) in &directions {
-            let color: DVec3 = own.iter().zip(basis).map(|(value, basis)| *value * *basis).sum();
-            let found = inverse.of((color + 0.5).max(DVec3::ZERO).to_array());
+            let color: DVec3 =
+                coefficients.iter().zip(basis).map(|(value, basis)| *value * *basis).sum();
+            let found = inverse.invert((color + 0.5).max(DVec3::ZERO).to_array());
             is_clipped |= found.is_clipped;
             let light = found.rgb.map(|x| raised * f64::from(linear_from_srgb(x as f32)));
             for (sum, basis) in fitted.iter_mut().zip(basis) {
@@ -82,18 +88,19 @@ pub(crate) fn linear_gaussians(
     let all: Vec<_> = (0..gaussians.count).into_par_iter().map(converted).collect();
     for (i, (fitted, _)) in all.iter().enumerate() {
         linear.dc_mut()[i] = fitted[0].as_vec3();
-        for (to, own) in linear.rest_mut()[rest * i..][..rest].iter_mut().zip(&fitted[1..]) {
-            *to = own.as_vec3();
+        for (to, coefficient) in linear.rest_mut()[rest * i..][..rest].iter_mut().zip(&fitted[1..])
+        {
+            *to = coefficient.as_vec3();
         }
     }
     (linear, all.iter().filter(|(_, is_clipped)| *is_clipped).count())
 }
 
 /// The stops by which one image of linear light is brighter than another, over all pixels; NaN if one is black.
-pub(crate) fn stops_between(own: &Image, other: &Image) -> f64 {
+pub(crate) fn stops_between(first: &Image, other: &Image) -> f64 {
     let light = |image: &Image| image.data.iter().map(|&x| f64::from(linear_from_srgb(x))).sum();
-    let [own, other]: [f64; 2] = [own, other].map(light);
-    (own / other).log2()
+    let [first, other]: [f64; 2] = [first, other].map(light);
+    (first / other).log2()
 }
 
 /// Counts the pixels where a curve is flat.
@@ -135,7 +142,7 @@ mod tests {
     #[test]
     fn the_colours_of_gaussians_become_their_light_in_every_direction() {
         let settings = ToneSettings::new(Tone::Auto);
-        let dark = MeasuredPhotograph::of(&[0.05; 300]);
+        let dark = MeasuredPhotograph::measure(&[0.05; 300]);
         let scene = SceneTone::from_photographs(&settings, &[dark]).unwrap();
         let inverse = scene.inverse_of_scene().unwrap();
         for degree in [0, 3] {
@@ -153,10 +160,13 @@ mod tests {
                     let all = std::iter::once(&model.dc()[0]).chain(rest).zip(basis);
                     (all.map(|(c, b)| c.as_dvec3() * b).sum::<DVec3>() + 0.5).to_array()
                 };
-                let expected = inverse.of(of(&gaussians)).rgb;
+                let expected = inverse.invert(of(&gaussians)).rgb;
                 let expected = expected.map(|x| 8.0 * f64::from(linear_from_srgb(x as f32)));
-                for (own, expected) in of(&linear).into_iter().zip(expected) {
-                    assert!((own - expected).abs() < 0.03 * expected + 1e-4, "{own} {expected}");
+                for (found, expected) in of(&linear).into_iter().zip(expected) {
+                    assert!(
+                        (found - expected).abs() < 0.03 * expected + 1e-4,
+                        "{found} {expected}"
+                    );
                 }
             }
         }
@@ -165,7 +175,7 @@ mod tests {
     /// The automatic curve's target of a dark photograph, and the inverse.
     fn brightened(dark: &Image) -> (InverseTone, Image) {
         let settings = ToneSettings::new(Tone::Auto);
-        let photograph = MeasuredPhotograph::of(&dark.data);
+        let photograph = MeasuredPhotograph::measure(&dark.data);
         let scene = SceneTone::from_photographs(&settings, &[photograph]).unwrap();
         let inverse = scene.inverse_of_scene().unwrap();
         let target = target_of(dark, &inverse);
@@ -181,10 +191,10 @@ mod tests {
             let sign = if (x + y).is_multiple_of(2) { 1.0 } else { -1.0 };
             target.pixel(x, y).map(|value| value + 0.002 * sign)
         });
-        let [own, other] = [&target, &off].map(|image| photograph_of(image, &inverse).0);
+        let [exact, other] = [&target, &off].map(|image| photograph_of(image, &inverse).0);
         let psnr = |a: &Image, b: &Image| psnr_of_counted(a, b, None).unwrap();
         let slope = slope_at(&target, &inverse);
-        let gained = psnr(&other, &own) - psnr(&off, &target);
+        let gained = psnr(&other, &exact) - psnr(&off, &target);
         assert!(slope > 2.0, "{slope}");
         assert!((gained - 20.0 * slope.log10()).abs() < 0.2, "{gained} dB, {slope}");
     }

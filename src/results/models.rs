@@ -9,7 +9,7 @@ use crate::results::export::{sog, spz};
 use crate::results::run;
 use crate::splats::model::{FileKind, Model};
 use crate::splats::scene::ply::parts::PartFile;
-use crate::splats::scene::{Facts, Gaussians, ply};
+use crate::splats::scene::{Gaussians, ModelFacts, ply};
 use crate::train::TrainConfig;
 
 impl Model {
@@ -31,7 +31,7 @@ impl Model {
 
 /// The Gaussians in the colours that viewers show, and the facts that the file or the run's configuration states. Warns
 /// if the near plane is missing.
-pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
+pub(crate) fn read(path: &Path) -> Result<(Gaussians, ModelFacts)> {
     if path.is_dir() {
         let config = run::load_config(path)?;
         let gaussians = run::load_gaussians(path)?;
@@ -39,7 +39,7 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
         return Ok((gaussians, facts_of_run(&config, file.as_ref())));
     }
     let bytes = input::bytes(path)?;
-    let parsed = match FileKind::of(&bytes) {
+    let parsed = match FileKind::from_bytes(&bytes) {
         Some(FileKind::Ply) => ply::parse(&bytes),
         Some(FileKind::Spz) => spz::decode(&bytes),
         Some(FileKind::Sog) => sog::decode(&bytes),
@@ -51,7 +51,7 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
 }
 
 /// Opens a PLY for reading part by part; `None` for other formats.
-pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, Facts)>> {
+pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, ModelFacts)>> {
     if path.is_dir() {
         let config = run::load_config(path)?;
         let file = PartFile::open(&path.join("model.ply"), part)?;
@@ -67,12 +67,12 @@ pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, F
 }
 
 /// The facts of a run's configuration, and the law that its model states; that of joined blocks states none.
-fn facts_of_run(config: &TrainConfig, model: Option<&PartFile>) -> Facts {
+fn facts_of_run(config: &TrainConfig, model: Option<&PartFile>) -> ModelFacts {
     let law = model.and_then(|model| model.facts().law);
-    Facts { law, ..config.facts(&config.frame.unwrap_or_default()) }
+    ModelFacts { law, ..config.facts(&config.frame.unwrap_or_default()) }
 }
 
-fn warn_of(path: &Path, facts: &Facts) {
+fn warn_of(path: &Path, facts: &ModelFacts) {
     if facts.near.is_none() {
         tracing::warn!("{}: does not state its near plane; the default is used", path.display());
     }

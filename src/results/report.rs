@@ -7,7 +7,7 @@ use crate::photographs::image::Image;
 pub use self::chart::{Chart, Mark, Series, VerticalLine};
 pub(crate) use self::data_uri::{base64, jpeg};
 pub use self::distribution::{Distribution, distributions};
-pub use self::table::{Best, Column, Table};
+pub use self::table::{Best, Column, NumberTable};
 
 mod axis;
 mod chart;
@@ -28,16 +28,16 @@ pub struct Report {
     /// Rows of images, in order.
     pub comparisons: Vec<Comparison>,
     /// Tables of text, in order.
-    pub facts: Vec<Facts>,
+    pub facts: Vec<TextTable>,
     /// Tables of numbers, in order.
-    pub tables: Vec<Table>,
+    pub tables: Vec<NumberTable>,
     /// Charts, in order.
     pub charts: Vec<Chart>,
 }
 
 /// A table of text.
 #[derive(Clone, Debug, Default)]
-pub struct Facts {
+pub struct TextTable {
     /// The caption.
     pub title: String,
     /// A name and its value in each row.
@@ -77,7 +77,7 @@ impl Picture {
 impl Report {
     /// The page as HTML: text, images, tables, charts.
     pub fn html(&self) -> String {
-        let facts: String = self.facts.iter().map(Facts::html).collect();
+        let facts: String = self.facts.iter().map(TextTable::html).collect();
         self.page(&(facts + &self.pictures_html() + &self.tables_html() + &self.charts_html()))
     }
 
@@ -87,7 +87,7 @@ impl Report {
     }
 
     fn tables_html(&self) -> String {
-        self.tables.iter().map(Table::html).collect()
+        self.tables.iter().map(NumberTable::html).collect()
     }
 
     fn charts_html(&self) -> String {
@@ -121,7 +121,7 @@ impl Report {
     }
 }
 
-impl Facts {
+impl TextTable {
     fn html(&self) -> String {
         let row = |[name, value]: &[String; 2]| {
             format!("<tr><th scope=\"row\">{}</th><td>{}</td></tr>\n", escape(name), escape(value))

@@ -12,14 +12,14 @@ use self::up::{Turn, Up};
 use crate::base::output::{is_same_file, write_whole};
 use crate::photographs::dataset::Dataset;
 use crate::photographs::targets::SceneTone;
-use crate::results::export::streamed::{self, Division, Tile, Written};
+use crate::results::export::streamed::{self, Division, TileLoader, Written};
 use crate::results::export::{Format, Provenance};
 use crate::results::finished_run::{Opener, config_of_file, is_model, needs_photographs};
 use crate::results::linear_light::linear_gaussians;
 use crate::results::{models, run};
-use crate::splats::joined::Manifest;
+use crate::splats::joined::TileManifest;
 use crate::splats::levels;
-use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE};
+use crate::splats::scene::{Gaussians, MAX_SH_DEGREE, ModelFacts};
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
@@ -61,7 +61,8 @@ pub(crate) struct Exported {
 impl ExportOptions<'_> {
     /// Writes the export.
     pub(crate) fn write(&self) -> Result<Exported> {
-        let joined = if is_model(self.source) { None } else { Manifest::of_scene(self.source)? };
+        let joined =
+            if is_model(self.source) { None } else { TileManifest::of_scene(self.source)? };
         match joined {
             Some(tiles) if self.format == Format::StreamedSog => self.write_tiles(&tiles),
             joined => self.write_whole(joined.as_ref()),
@@ -69,16 +70,16 @@ impl ExportOptions<'_> {
     }
 
     /// Writes the tiles of a joined model, one at a time.
-    fn write_tiles(&self, manifest: &Manifest) -> Result<Exported> {
+    fn write_tiles(&self, manifest: &TileManifest) -> Result<Exported> {
         let config = run::load_config(self.source)?;
         let turn = self.turn(&config);
         let rotation = turn.as_ref().map_or(DQuat::IDENTITY, |turn| turn.rotation);
         let facts = config.facts(&config.frame.unwrap_or_default());
         let provenance = Provenance { rotation, facts, ..self.provenance(&config) };
-        let tiles: Vec<Tile<'_>> = manifest
+        let tiles: Vec<TileLoader<'_>> = manifest
             .tiles
             .iter()
-            .map(|tile| Tile {
+            .map(|tile| TileLoader {
                 name: manifest.folder.join(&tile.file),
                 count: tile.count,
                 load: Box::new(move || Ok(Cow::Owned(turned(manifest.read(tile)?, rotation)))),
@@ -90,7 +91,7 @@ impl ExportOptions<'_> {
         Ok(Exported { path, count, streamed: Some(written), origin, turn })
     }
 
-    fn write_whole(&self, joined: Option<&Manifest>) -> Result<Exported> {
+    fn write_whole(&self, joined: Option<&TileManifest>) -> Result<Exported> {
         let (gaussians, facts, config) = self.open()?;
         let (gaussians, facts) = match self.linear {
             true => self.in_linear_light(&gaussians, facts, &config)?,
@@ -113,7 +114,7 @@ impl ExportOptions<'_> {
         let rotation = turn.as_ref().map_or(DQuat::IDENTITY, |turn| turn.rotation);
         let mut gaussians = turned(gaussians, rotation);
         if self.level > 0 {
-            let tiles = joined.map_or_else(|| vec![gaussians.count], Manifest::counts);
+            let tiles = joined.map_or_else(|| vec![gaussians.count], TileManifest::counts);
             gaussians = levels::level(&gaussians, &tiles, self.division.cell(), self.level);
         }
         let provenance = Provenance { rotation, facts, ..self.provenance(&config) };
@@ -125,7 +126,7 @@ impl ExportOptions<'_> {
                 Format::Ply.write(&padded, &provenance, &path)?;
             }
             Format::StreamedSog => {
-                let tile = Tile::whole(self.source, &gaussians);
+                let tile = TileLoader::whole(self.source, &gaussians);
                 streamed = Some(streamed::write(&path, &[tile], &provenance, self.division)?);
             }
             Format::Html => {
@@ -139,7 +140,7 @@ impl ExportOptions<'_> {
     }
 
     /// The model as stored, what is stated of it, and its settings.
-    fn open(&self) -> Result<(Gaussians, Facts, TrainConfig)> {
+    fn open(&self) -> Result<(Gaussians, ModelFacts, TrainConfig)> {
         let source = self.source;
         if !is_model(source) {
             let config = run::load_config(source)?;
@@ -158,9 +159,9 @@ impl ExportOptions<'_> {
     fn in_linear_light(
         &self,
         gaussians: &Gaussians,
-        facts: Facts,
+        facts: ModelFacts,
         config: &TrainConfig,
-    ) -> Result<(Gaussians, Facts)> {
+    ) -> Result<(Gaussians, ModelFacts)> {
         let config = self.with_dataset(config);
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
         let inverse = SceneTone::measure(&config.tone, &dataset)?.inverse_of_scene()?;
@@ -173,7 +174,7 @@ impl ExportOptions<'_> {
                  at least what is written"
             );
         }
-        Ok((linear, Facts { linear: Some(stops as f32), law: None, ..facts }))
+        Ok((linear, ModelFacts { linear: Some(stops as f32), law: None, ..facts }))
     }
 
     /// The settings with the dataset where it is now.

@@ -37,7 +37,7 @@ pub(crate) struct RunFacts {
 }
 
 impl RunFacts {
-    pub(crate) fn of(
+    pub(crate) fn new(
         gpu: &Gpu,
         config: &TrainConfig,
         plan: Option<&Plan>,

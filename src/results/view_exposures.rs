@@ -6,7 +6,7 @@ use std::path::Path;
 use super::run;
 use crate::loss::exposure::Affine;
 use crate::photographs::image::Image;
-use crate::photographs::tone::exposed_anew;
+use crate::photographs::tone::exposure_knots;
 use crate::{Error, Result};
 
 /// The exposures of the training views relative to that of the model.
@@ -18,7 +18,7 @@ pub(crate) enum ViewExposures {
 }
 
 impl ViewExposures {
-    pub(crate) fn of(run: &Path) -> Result<Self> {
+    pub(crate) fn load(run: &Path) -> Result<Self> {
         let learned = run::load_exposures(run)?;
         if !learned.is_empty() {
             return Ok(Self::Learned(learned));
@@ -34,14 +34,14 @@ impl ViewExposures {
     pub(crate) fn applied(&self, view: &str, mut image: Image) -> Image {
         let exposure = match self {
             Self::Learned(exposures) => {
-                let own = exposures.get(view);
-                return own.map_or(image.clone(), |own| own.applied(&image));
+                let affine = exposures.get(view);
+                return affine.map_or(image.clone(), |affine| affine.applied(&image));
             }
             Self::OfTargets(exposure) => exposure,
         };
         let Some(gain) = exposure.gains.get(view) else { return image };
         let weight = exposure.scene.weight.unwrap_or(1.0);
-        let knots = exposed_anew([exposure.model_gain, *gain], weight);
+        let knots = exposure_knots([exposure.model_gain, *gain], weight);
         for x in &mut image.data {
             let inside = x.clamp(knots[0][0], knots[knots.len() - 1][0]);
             let above = knots.partition_point(|knot| knot[0] <= inside).clamp(1, knots.len() - 1);

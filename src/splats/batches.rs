@@ -137,7 +137,7 @@ impl Batches {
             return gpu.write(buffer, planes);
         }
         let mut batched = Vec::with_capacity(self.floats());
-        for Part { range, columns } in self.parts() {
+        for BufferPart { range, columns } in self.parts() {
             let rows = &planes[range];
             (0..columns).for_each(|k| batched.extend(rows.iter().skip(k).step_by(columns)));
         }
@@ -153,7 +153,7 @@ impl Batches {
         }
         let mut planes = vec![0.0; self.planes.total()];
         let mut rest = batched.as_slice();
-        for Part { range, columns } in self.parts() {
+        for BufferPart { range, columns } in self.parts() {
             let (part, others) = rest.split_at(range.len());
             let count = (range.len() / columns).max(1);
             for (k, column) in part.chunks(count).enumerate() {
@@ -168,7 +168,7 @@ impl Batches {
     /// The index of a float of a buffer in the planes of all Gaussians.
     pub fn index_of(&self, float: usize) -> usize {
         let mut before = 0;
-        for Part { range, columns } in self.parts() {
+        for BufferPart { range, columns } in self.parts() {
             let (offset, count) = (float - before, range.len() / columns);
             if offset < range.len() {
                 return range.start + offset % count * columns + offset / count;
@@ -185,7 +185,7 @@ impl Batches {
     }
 
     /// The parts of a buffer, in order.
-    fn parts(&self) -> impl Iterator<Item = Part> + use<> {
+    fn parts(&self) -> impl Iterator<Item = BufferPart> + use<> {
         let Self { planes: PlaneCounts { gaussians: count, columns, features }, .. } = *self;
         let rest_by_column = self.rest_by_column;
         self.iter().flat_map(move |batch| {
@@ -197,14 +197,14 @@ impl Batches {
                 let is_by_column = rest_by_column && attribute == Attribute::Rest;
                 let columns = if is_by_column { width.max(1) } else { 1 };
                 let left_out = frozen.saturating_sub(column * batch.count).min(end - begin);
-                Part { range: begin + left_out..end, columns }
+                BufferPart { range: begin + left_out..end, columns }
             })
         })
     }
 }
 
 /// A part of a buffer.
-struct Part {
+struct BufferPart {
     /// The corresponding range of the planes of all Gaussians.
     range: Range<usize>,
     /// The columns that the part stores one after the other; 1: as in the range.

@@ -134,12 +134,12 @@ pub struct Densifier {
     moments: Pipeline<densify_moments::Kernel>,
     sort: RadixSort,
     scan: Scan,
-    scratch: Scratch,
+    scratch: DensifyScratch,
 }
 
 /// The decision for every Gaussian.
 #[derive(Debug)]
-struct Scratch {
+struct DensifyScratch {
     keys: Buffer<u32>,
     ids: Buffer<u32>,
     actions: Buffer<u32>,
@@ -150,7 +150,7 @@ struct Scratch {
     count: Buffer<u32>,
 }
 
-impl Scratch {
+impl DensifyScratch {
     fn new(gpu: &Gpu, capacity: usize) -> Result<Self> {
         Ok(Self {
             keys: gpu.uninit("densify_keys", capacity)?,
@@ -198,7 +198,7 @@ impl Densifier {
             moments: gpu.pipeline(&densify_moments::Constants { rest_by_column })?,
             sort: RadixSort::new(gpu, 0)?,
             scan: Scan::new(gpu, 0)?,
-            scratch: Scratch::new(gpu, 0)?,
+            scratch: DensifyScratch::new(gpu, 0)?,
         })
     }
 
@@ -259,7 +259,7 @@ impl Densifier {
         let (columns, count) = (layout.words(), layout.count as u32);
         let feature_count = layout.floats().features as u32;
         if self.scratch.keys.len() < layout.count {
-            self.scratch = Scratch::new(&self.gpu, grad_norm_sums.len())?;
+            self.scratch = DensifyScratch::new(&self.gpu, grad_norm_sums.len())?;
         }
         let DensifySettings { gradient_threshold, split_scale, min_opacity, near, .. } =
             self.settings;
@@ -316,7 +316,7 @@ impl Densifier {
                 let threads = Threads::Exactly([count, 1, 1]);
                 pass.dispatch(&self.decide, &decide(batch), buffers, threads)?;
             }
-            let Scratch { child_counts, offsets, total, .. } = scratch;
+            let DensifyScratch { child_counts, offsets, total, .. } = scratch;
             scan.record(pass, counted, child_counts, offsets, total)?;
             pass.download(&scratch.counters)
         })?;
@@ -349,7 +349,7 @@ impl Densifier {
             spare_buffers.widen(inputs.gradients);
         }
         let target = spare_buffers.words.as_mut().unwrap_or(inputs.gradients);
-        let Scratch { actions, offsets, .. } = &self.scratch;
+        let DensifyScratch { actions, offsets, .. } = &self.scratch;
         let pairs = self.pairs(&gaussians.layout, report);
         self.gpu.run("densify_scatter", |pass| {
             for &(from, to) in &pairs {
@@ -384,7 +384,7 @@ impl Densifier {
             first_new_gaussian: to.first_gaussian(),
         };
         let DensifyInputs { moments, grad_norm_sums, visit_counts, gradients: spare } = inputs;
-        let Scratch { actions, offsets, .. } = &self.scratch;
+        let DensifyScratch { actions, offsets, .. } = &self.scratch;
         let pairs = self.pairs(&gaussians.layout, report);
         std::mem::swap(&mut gaussians.parameters, spare_buffers.words.as_mut().unwrap_or(spare));
         self.gpu.run("densify_moments", |pass| {

@@ -20,7 +20,7 @@ pub(crate) const VERSION: u32 = 1;
 /// The tiles of a model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Manifest {
+pub(crate) struct TileManifest {
     pub(crate) version: u32,
     /// The checksum of the plan of blocks.
     pub(crate) plan: String,
@@ -31,7 +31,7 @@ pub(crate) struct Manifest {
     /// The devices on which the blocks were trained, by name and driver.
     pub(crate) devices: Vec<String>,
     /// In the order of the blocks.
-    pub(crate) tiles: Vec<Tile>,
+    pub(crate) tiles: Vec<ModelTile>,
     /// The folder that it was read from.
     #[serde(skip)]
     pub(crate) folder: PathBuf,
@@ -40,7 +40,7 @@ pub(crate) struct Manifest {
 /// A file of a model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Tile {
+pub(crate) struct ModelTile {
     /// The name of its block.
     pub(crate) id: String,
     /// The file, relative to the manifest's folder.
@@ -52,7 +52,7 @@ pub(crate) struct Tile {
     pub(crate) sha256: String,
 }
 
-impl Manifest {
+impl TileManifest {
     /// The manifest of the model of a scene; `None` if it is not in tiles.
     pub(crate) fn of_scene(folder: &Path) -> Result<Option<Self>> {
         let model = folder.join(MODEL);
@@ -95,7 +95,7 @@ impl Manifest {
     }
 
     /// Reads a tile.
-    pub(crate) fn read(&self, tile: &Tile) -> Result<Gaussians> {
+    pub(crate) fn read(&self, tile: &ModelTile) -> Result<Gaussians> {
         let path = self.folder.join(&tile.file);
         let gaussians = ply::load(&path)?;
         if gaussians.count == tile.count {

@@ -137,7 +137,7 @@ pub fn level(gaussians: &Gaussians, tiles: &[usize], most: usize, level: usize) 
 
 /// The shape of a Gaussian and what it looks like.
 #[derive(Clone, Copy)]
-struct Part {
+struct MergedGaussian {
     mean: DVec3,
     covariance: DMat3,
     opacity: f64,
@@ -149,7 +149,7 @@ struct Part {
 
 /// The merging of a cell.
 struct Merging {
-    parts: Vec<Part>,
+    parts: Vec<MergedGaussian>,
     /// Attributes that are averaged, a row a Gaussian.
     rows: Vec<f64>,
     width: usize,
@@ -157,7 +157,7 @@ struct Merging {
     /// Counts the changes of each, so that older candidates are recognised; [`GONE`] of one merged into another.
     versions: Vec<u32>,
     /// The least change first.
-    candidates: BinaryHeap<Reverse<Candidate>>,
+    candidates: BinaryHeap<Reverse<MergeCandidate>>,
 }
 
 /// The version of a Gaussian that is merged into another.
@@ -165,21 +165,21 @@ const GONE: u32 = u32::MAX;
 
 /// Two neighbours that can be merged.
 #[derive(PartialEq)]
-struct Candidate {
+struct MergeCandidate {
     change: f64,
     pair: [u32; 2],
     versions: [u32; 2],
 }
 
-impl Eq for Candidate {}
+impl Eq for MergeCandidate {}
 
-impl Ord for Candidate {
+impl Ord for MergeCandidate {
     fn cmp(&self, other: &Self) -> Ordering {
         self.change.total_cmp(&other.change).then(self.pair.cmp(&other.pair))
     }
 }
 
-impl PartialOrd for Candidate {
+impl PartialOrd for MergeCandidate {
     fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
         Some(self.cmp(other))
     }
@@ -202,7 +202,7 @@ impl Merging {
         }
         let neighbours = gaussians.nearest_of_each::<NEIGHBOURS>();
         let mut merging = Self {
-            parts: (0..count).map(|index| Part::of(gaussians, index)).collect(),
+            parts: (0..count).map(|index| MergedGaussian::new(gaussians, index)).collect(),
             rows,
             width,
             neighbours: vec![vec![]; count],
@@ -233,12 +233,12 @@ impl Merging {
         let [first, second] = pair.map(|index| &self.parts[index as usize]);
         let change = change(first, second, &merged(first, second).0);
         let versions = pair.map(|index| self.versions[index as usize]);
-        self.candidates.push(Reverse(Candidate { change, pair, versions }));
+        self.candidates.push(Reverse(MergeCandidate { change, pair, versions }));
     }
 
     /// Merges the pair of least change, and returns it; `None` if there is no pair.
     fn merge_next(&mut self) -> Option<f64> {
-        while let Some(Reverse(Candidate { pair, versions, change })) = self.candidates.pop() {
+        while let Some(Reverse(MergeCandidate { pair, versions, change })) = self.candidates.pop() {
             if pair.map(|index| self.versions[index as usize]) == versions {
                 self.merge(pair);
                 return Some(change);
@@ -308,8 +308,8 @@ impl Merging {
     }
 }
 
-impl Part {
-    fn of(gaussians: &Gaussians, index: usize) -> Self {
+impl MergedGaussian {
+    fn new(gaussians: &Gaussians, index: usize) -> Self {
         let [w, x, y, z] = gaussians.quats()[index].map(f64::from);
         let rotation = DQuat::from_xyzw(x, y, z, w);
         let rotation =
@@ -331,7 +331,7 @@ impl Part {
 }
 
 /// A Gaussian in place of two, and the share of the first one's colour in its own.
-fn merged(a: &Part, b: &Part) -> (Part, f64) {
+fn merged(a: &MergedGaussian, b: &MergedGaussian) -> (MergedGaussian, f64) {
     let offset = b.mean - a.mean;
     let both = a.covariance + b.covariance;
     // Flat ones of one plane have no inverse.
@@ -354,7 +354,7 @@ fn merged(a: &Part, b: &Part) -> (Part, f64) {
     let opacity = weight / merged_areas.element_sum();
     let growth = (opacity / MAX_OPACITY).max(1.0);
     let share = (weight_a - 0.5 * weight_ab) / weight;
-    let part = Part {
+    let part = MergedGaussian {
         mean: a.mean + mean,
         covariance: covariance * growth,
         opacity: opacity.min(MAX_OPACITY),
@@ -365,8 +365,8 @@ fn merged(a: &Part, b: &Part) -> (Part, f64) {
 }
 
 /// The integral of the squared change of an image by a merged Gaussian in place of two, in units of 2 pi.
-fn change(a: &Part, b: &Part, merged: &Part) -> f64 {
-    let product = |first: &Part, second: &Part| {
+fn change(a: &MergedGaussian, b: &MergedGaussian, merged: &MergedGaussian) -> f64 {
+    let product = |first: &MergedGaussian, second: &MergedGaussian| {
         first.opacity * second.opacity * first.color.dot(second.color) * overlap(first, second)
     };
     product(a, a)
@@ -392,7 +392,7 @@ fn areas(covariance: DMat3) -> DVec3 {
 }
 
 /// The integral of the product of two Gaussians of height 1, summed over the planes, in units of 2 pi.
-fn overlap(a: &Part, b: &Part) -> f64 {
+fn overlap(a: &MergedGaussian, b: &MergedGaussian) -> f64 {
     let offset = b.mean - a.mean;
     let both = a.covariance + b.covariance;
     let determinants = determinants(both);

@@ -15,7 +15,7 @@ use crate::splats::render::RenderSettings;
 use crate::splats::scene::Features;
 #[cfg(any(test, not(feature = "io")))]
 use crate::splats::scene::ply;
-use crate::splats::scene::{Facts, Gaussians};
+use crate::splats::scene::{Gaussians, ModelFacts};
 #[cfg(any(test, feature = "capi", not(feature = "io")))]
 use crate::{Error, Result};
 
@@ -48,7 +48,7 @@ impl From<Gaussians> for Model {
 
 impl Model {
     /// Gaussians in their own colours, and what is stated of them.
-    pub(crate) fn of(gaussians: Gaussians, facts: &Facts) -> Self {
+    pub(crate) fn new(gaussians: Gaussians, facts: &ModelFacts) -> Self {
         let defaults = Self::from(gaussians);
         Self {
             near: facts.near.unwrap_or(defaults.near),
@@ -60,9 +60,9 @@ impl Model {
         }
     }
 
-    /// As [`Model::of`], of Gaussians in the colours that viewers show, as files hold them.
-    pub(crate) fn of_shown(gaussians: Gaussians, facts: &Facts) -> Self {
-        let mut model = Self::of(gaussians, facts);
+    /// As [`Model::new`], of Gaussians in the colours that viewers show, as files hold them.
+    pub(crate) fn of_shown(gaussians: Gaussians, facts: &ModelFacts) -> Self {
+        let mut model = Self::new(gaussians, facts);
         if model.raw_colors {
             model.gaussians.shift_colors(0.5);
         }
@@ -109,8 +109,8 @@ impl Model {
             if deviation_from_rigid(pose).is_some() {
                 return refuse("has a pose that is not rigid; take scale and reflection out");
             }
-            let look = |part: &Self| (part.raw_colors, part.max_alpha, part.antialiased);
-            if look(part) != look(first) {
+            let appearance = |part: &Self| (part.raw_colors, part.max_alpha, part.antialiased);
+            if appearance(part) != appearance(first) {
                 return refuse("has other colours, alpha limit or antialiasing than the first");
             }
             let shown = part.gaussians.with_features(Features::NONE);
@@ -139,8 +139,8 @@ impl Model {
     }
 
     /// What a file states of the model.
-    pub(crate) fn facts(&self) -> Facts {
-        Facts {
+    pub(crate) fn facts(&self) -> ModelFacts {
+        ModelFacts {
             near: Some(self.near),
             max_alpha: Some(self.max_alpha),
             raw_colors: Some(self.raw_colors),
@@ -173,7 +173,7 @@ fn load_ply(path: &std::path::Path) -> Result<Model> {
         return Err(Error::input(path, format!("is a folder; a run directory {REMEDY}")));
     }
     let bytes = input::bytes(path)?;
-    match FileKind::of(&bytes) {
+    match FileKind::from_bytes(&bytes) {
         Some(kind @ (FileKind::Spz | FileKind::Sog)) => {
             let name = format!("{kind:?}").to_uppercase();
             Err(Error::input(path, format!("{name} {REMEDY}")))
@@ -196,7 +196,7 @@ pub(crate) enum FileKind {
 
 impl FileKind {
     /// By the first bytes.
-    pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
+    pub(crate) fn from_bytes(bytes: &[u8]) -> Option<Self> {
         match bytes {
             [b'p', b'l', b'y', ..] => Some(Self::Ply),
             [b'N', b'G', b'S', b'P', ..] | [0x1f, 0x8b, ..] => Some(Self::Spz),

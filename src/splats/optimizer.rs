@@ -36,11 +36,11 @@ pub enum Moments<P = Buffer<f32>> {
 impl Moments {
     /// Zero moments for `len` parameters.
     pub fn zeros(gpu: &Gpu, len: usize) -> Result<Self> {
-        Self::of(StorageFormat::Single, |name| gpu.zeros(name, len))
+        Self::new(StorageFormat::Single, |name| gpu.zeros(name, len))
     }
 
     /// Moments whose planes `make` allocates, by name.
-    pub(crate) fn of(
+    pub(crate) fn new(
         bits: StorageFormat,
         mut plane: impl FnMut(&'static str) -> Result<Buffer<f32>>,
     ) -> Result<Self> {

@@ -353,7 +353,7 @@ impl Renderer {
         &mut self,
         pass: &mut Recorder<'_>,
         gaussians: GaussianSlice<'_>,
-        view: &View<'_>,
+        view: &KernelView<'_>,
         sh_degree: u32,
     ) -> Result<()> {
         let Self { gpu, settings, projections, frame, context, lamp, .. } = self;
@@ -425,7 +425,7 @@ impl Renderer {
         &mut self,
         pass: &mut Recorder<'_>,
         gaussian_count: u32,
-        view: &View<'_>,
+        view: &KernelView<'_>,
         capacity: Option<u32>,
     ) -> Result<()> {
         let frame = &mut self.frame;
@@ -489,7 +489,7 @@ impl Renderer {
         (size + tile - 1) / tile
     }
 
-    fn view<'a>(&mut self, viewpoint: &Viewpoint<'a>, view_depths: bool) -> Result<View<'a>> {
+    fn view<'a>(&mut self, viewpoint: &Viewpoint<'a>, view_depths: bool) -> Result<KernelView<'a>> {
         let Viewpoint { patch, on_device } = viewpoint;
         let tiles = self.tiles(patch.size);
         let channels = self.settings.channels() + usize::from(view_depths);
@@ -505,12 +505,12 @@ impl Renderer {
         let (cameras, camera_index) = on_device.unzip();
         let camera_index = camera_index.unwrap_or_default();
         let (size, half_view) = (patch.size, patch.half_view());
-        Ok(View { kind, channels, cameras, camera_index, size, half_view, tiles })
+        Ok(KernelView { kind, channels, cameras, camera_index, size, half_view, tiles })
     }
 }
 
 /// A viewpoint as the kernels take it, and the columns and rows of tiles of its image.
-struct View<'a> {
+struct KernelView<'a> {
     kind: ProjectionKind,
     /// Values per pixel.
     channels: usize,
@@ -522,7 +522,7 @@ struct View<'a> {
     tiles: UVec2,
 }
 
-impl View<'_> {
+impl KernelView<'_> {
     fn tile_count(&self) -> u32 {
         self.tiles.x * self.tiles.y
     }

@@ -25,7 +25,7 @@ use crate::splats::harmonics::HarmonicRotation;
 #[cfg(feature = "io")]
 pub(crate) use change::{Lengths, is_far};
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
-pub use facts::Facts;
+pub use facts::ModelFacts;
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
 
 pub use crate::kernels::sh::MAX_SH_DEGREE;

@@ -1,7 +1,7 @@
 //! The best model of a run so far, kept on the host and restored if the run ends worse.
 
 use super::Trainer;
-use super::model::Model;
+use super::model::TrainedModel;
 use crate::Result;
 
 /// A tensor of a checkpoint: name, shape and values.
@@ -24,7 +24,8 @@ impl Trainer {
     /// Restores the parameters; moments and statistics are reset.
     pub(super) fn restore_snapshot(&mut self, snapshot: &Snapshot) -> Result<()> {
         let gpu = self.gpu.clone();
-        let shape = |(name, shape, _): &Tensor| (name == Model::PARAMETERS).then(|| shape.clone());
+        let shape =
+            |(name, shape, _): &Tensor| (name == TrainedModel::PARAMETERS).then(|| shape.clone());
         if let Some([words, count]) = snapshot.iter().find_map(shape).as_deref() {
             let sh_degree = self.model.sh_degree_of_words(*words);
             self.model = self.model.zeros_like(&gpu, *count, sh_degree)?;

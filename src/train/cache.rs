@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use serde::{Deserialize, Serialize};
 
 use crate::gpu::Gpu;
-use crate::photographs::pseudo_gt::Encoded;
+use crate::photographs::pseudo_gt::EncodedPlanes;
 use crate::{Error, Result};
 
 /// The default share of photographs in the memory of the device and of the host.
@@ -119,12 +119,12 @@ pub(super) struct Cache {
 
 /// The index of a photograph in the cache.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Slot(usize);
+pub(super) struct CacheSlot(usize);
 
 /// A photograph on the device, in the file, or both.
 #[derive(Debug)]
 pub(super) struct CachedImage {
-    on_device: Option<Arc<Encoded>>,
+    on_device: Option<Arc<EncodedPlanes>>,
     in_file: Option<InFile>,
     bytes: u64,
     /// The time of its last use.
@@ -139,8 +139,8 @@ impl Cache {
     }
 
     /// Adds a photograph, which stays on the device if it fits.
-    pub(super) fn keep(&mut self, photograph: Encoded) -> Result<Slot> {
-        let place = self.kept.len();
+    pub(super) fn keep(&mut self, photograph: EncodedPlanes) -> Result<CacheSlot> {
+        let index = self.kept.len();
         let bytes = photograph.bytes();
         self.kept.push(CachedImage {
             in_file: None,
@@ -148,28 +148,28 @@ impl Cache {
             asked: 0,
             on_device: Some(Arc::new(photograph)),
         });
-        self.on_device.insert((0, place));
+        self.on_device.insert((0, index));
         self.taken += bytes;
         if self.taken > self.budget {
-            self.evict(place)?;
+            self.evict(index)?;
         }
-        Ok(Slot(place))
+        Ok(CacheSlot(index))
     }
 
     /// The size of a photograph on the device, in bytes.
-    pub(super) fn bytes(&self, Slot(place): Slot) -> u64 {
-        self.kept[place].bytes
+    pub(super) fn bytes(&self, CacheSlot(index): CacheSlot) -> u64 {
+        self.kept[index].bytes
     }
 
     /// A resident photograph.
-    pub(super) fn on_device(&self, Slot(place): Slot) -> Result<&Encoded> {
+    pub(super) fn on_device(&self, CacheSlot(index): CacheSlot) -> Result<&EncodedPlanes> {
         let absent = || Error::Usage("a training photograph is not on the device".to_owned());
-        self.kept[place].on_device.as_deref().ok_or_else(absent)
+        self.kept[index].on_device.as_deref().ok_or_else(absent)
     }
 
     /// A photograph, resident or not.
-    pub(super) fn load(&self, Slot(place): Slot) -> Result<Arc<Encoded>> {
-        match &self.kept[place] {
+    pub(super) fn load(&self, CacheSlot(index): CacheSlot) -> Result<Arc<EncodedPlanes>> {
+        match &self.kept[index] {
             CachedImage { on_device: Some(photograph), .. } => Ok(Arc::clone(photograph)),
             CachedImage { in_file: Some(in_file), .. } => Ok(Arc::new(in_file.load(&self.gpu)?)),
             _ => Err(Error::Usage("a photograph is missing from the cache".to_owned())),
@@ -187,17 +187,17 @@ impl Cache {
     }
 
     /// Makes `wanted` resident until the next call, evicting the least recently used.
-    pub(super) fn make_resident(&mut self, wanted: &[Slot]) -> Result<()> {
+    pub(super) fn make_resident(&mut self, wanted: &[CacheSlot]) -> Result<()> {
         self.clock += 1;
-        for &Slot(place) in wanted {
-            let kept = &mut self.kept[place];
-            if self.on_device.remove(&(kept.asked, place)) {
-                self.on_device.insert((self.clock, place));
+        for &CacheSlot(index) in wanted {
+            let kept = &mut self.kept[index];
+            if self.on_device.remove(&(kept.asked, index)) {
+                self.on_device.insert((self.clock, index));
             }
             kept.asked = self.clock;
         }
-        for &Slot(place) in wanted {
-            let CachedImage { on_device: None, bytes, .. } = self.kept[place] else { continue };
+        for &CacheSlot(index) in wanted {
+            let CachedImage { on_device: None, bytes, .. } = self.kept[index] else { continue };
             while self.taken + bytes > self.budget {
                 let oldest = self.on_device.first().copied();
                 let Some((_, idle)) = oldest.filter(|(asked, _)| *asked < self.clock) else {
@@ -205,10 +205,10 @@ impl Cache {
                 };
                 self.evict(idle)?;
             }
-            let kept = &mut self.kept[place];
+            let kept = &mut self.kept[index];
             if let Some(in_file) = &kept.in_file {
                 kept.on_device = Some(Arc::new(in_file.load(&self.gpu)?));
-                self.on_device.insert((self.clock, place));
+                self.on_device.insert((self.clock, index));
                 self.taken += bytes;
             }
         }
@@ -216,10 +216,10 @@ impl Cache {
     }
 
     /// Evicts a photograph; the first time, it is written to the spool file.
-    fn evict(&mut self, place: usize) -> Result<()> {
-        let kept = &mut self.kept[place];
+    fn evict(&mut self, index: usize) -> Result<()> {
+        let kept = &mut self.kept[index];
         let Some(photograph) = kept.on_device.take() else { return Ok(()) };
-        self.on_device.remove(&(kept.asked, place));
+        self.on_device.remove(&(kept.asked, index));
         if kept.in_file.is_none() {
             let spool = match &self.spool {
                 Some(spool) => Arc::clone(spool),
@@ -254,8 +254,8 @@ struct InFile {
 }
 
 impl InFile {
-    fn save(gpu: &Gpu, photograph: &Encoded, spool: &Arc<Spool>) -> Result<Self> {
-        let Encoded { code_bits, value_count, codes, values } = photograph;
+    fn save(gpu: &Gpu, photograph: &EncodedPlanes, spool: &Arc<Spool>) -> Result<Self> {
+        let EncodedPlanes { code_bits, value_count, codes, values } = photograph;
         let name = if codes.is_empty() { values.name() } else { codes.name() }.to_owned();
         let (codes, values) = (gpu.read(codes)?, gpu.read(&**values)?);
         let parts = [bytemuck::cast_slice(&codes), bytemuck::cast_slice(&values)];
@@ -269,12 +269,12 @@ impl InFile {
         })
     }
 
-    fn load(&self, gpu: &Gpu) -> Result<Encoded> {
+    fn load(&self, gpu: &Gpu) -> Result<EncodedPlanes> {
         let &Self { ref spool, ref name, offset, code_bits, value_count, lens } = self;
         let codes: Vec<u32> = spool.read(offset, lens[0])?;
         let values: Vec<f32> =
             spool.read(offset + size_of_val(codes.as_slice()) as u64, lens[1])?;
-        Ok(Encoded {
+        Ok(EncodedPlanes {
             code_bits,
             value_count,
             codes: gpu.buffer(name, &codes)?,
@@ -357,7 +357,7 @@ mod tests {
     fn every_photograph_is_restored_bit_for_bit_whatever_the_cache_size() {
         let gpu = gpu();
         let pseudo_gt = PseudoGt::new(&gpu, &ToneSettings::default()).unwrap();
-        let decoded = |photograph: &Encoded| {
+        let decoded = |photograph: &EncodedPlanes| {
             let mut scratch = gpu.uninit("decoded", 9000).unwrap();
             let mut plain = None;
             gpu.run("decode", |pass| {
@@ -380,21 +380,21 @@ mod tests {
             let slots = kept.collect::<Result<Vec<_>>>().unwrap();
             assert_eq!(cache.holds_all(), budget == 1 << 30);
             for wanted in [&[0, 1][..], &[6], &[5, 2], &[3], &[0, 4], &[2]] {
-                let of_wanted: Vec<Slot> = wanted.iter().map(|&place| slots[place]).collect();
+                let of_wanted: Vec<CacheSlot> = wanted.iter().map(|&index| slots[index]).collect();
                 cache.make_resident(&of_wanted).unwrap();
-                for &place in wanted {
-                    let brought = cache.on_device(slots[place]).unwrap();
-                    assert!(decoded(brought) == values(place), "{budget}: {place}");
+                for &index in wanted {
+                    let brought = cache.on_device(slots[index]).unwrap();
+                    assert!(decoded(brought) == values(index), "{budget}: {index}");
                 }
                 let kept = &cache.kept;
                 let on_device: u64 =
                     kept.iter().filter(|one| one.on_device.is_some()).map(|one| one.bytes).sum();
                 assert_eq!(on_device, cache.taken);
-                let asked: u64 = wanted.iter().map(|&place| kept[place].bytes).sum();
+                let asked: u64 = wanted.iter().map(|&index| kept[index].bytes).sum();
                 assert!(cache.taken <= budget.max(asked), "{} of {budget}", cache.taken);
             }
-            for (place, &slot) in slots.iter().enumerate() {
-                assert!(decoded(&cache.load(slot).unwrap()) == values(place));
+            for (index, &slot) in slots.iter().enumerate() {
+                assert!(decoded(&cache.load(slot).unwrap()) == values(index));
             }
         }
     }

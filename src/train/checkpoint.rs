@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use super::best::{Snapshot, Tensor};
 use super::decisions::Decisions;
 use super::lamp::LEARNED;
-use super::model::Model;
+use super::model::TrainedModel;
 use super::{TrainConfig, Trainer};
 use crate::base::hash::{self, Hasher};
 use crate::base::input;
@@ -28,7 +28,7 @@ use crate::splats::optimizer::{AdamBuffers, Moments};
 use crate::splats::scene::{Gaussians, Shape, width};
 use crate::{Error, Result};
 
-/// The metadata key of the [`Header`], as JSON; a single key, since several would be written in random order.
+/// The metadata key of the [`CheckpointHeader`], as JSON; a single key, since several would be written in random order.
 const HEADER: &str = "checkpoint";
 
 const FORMAT: &str = "nightsplat checkpoint 1";
@@ -40,7 +40,7 @@ const VISIT_COUNTS: &str = "density.visit_counts";
 
 /// The header of a checkpoint.
 #[derive(Serialize, Deserialize)]
-struct Header {
+struct CheckpointHeader {
     format: String,
     /// Steps done.
     step: u64,
@@ -56,7 +56,7 @@ struct Header {
     checksum: String,
 }
 
-impl Header {
+impl CheckpointHeader {
     /// The checksum of a file with this header and these tensors, in the order of their names.
     fn checksum_with(&self, mut tensors: Vec<(String, &[u8])>) -> String {
         let Self { format, step, config, decisions, left_out, dataset, .. } = self;
@@ -82,8 +82,9 @@ pub fn check_checkpoint(path: &Path) -> Result<()> {
     let bytes = input::bytes(path)?;
     let damaged =
         |problem: &str| Error::input(path, format!("is not an intact checkpoint ({problem})"));
-    let file = TensorFile::of(&bytes).map_err(|error| damaged(&error.to_string()))?;
-    let header = file.note(HEADER).and_then(|header| serde_json::from_str::<Header>(header).ok());
+    let file = TensorFile::parse(&bytes).map_err(|error| damaged(&error.to_string()))?;
+    let header =
+        file.note(HEADER).and_then(|header| serde_json::from_str::<CheckpointHeader>(header).ok());
     match header {
         Some(header) if header.describes(&file) => Ok(()),
         Some(_) => Err(damaged("its checksum does not match")),
@@ -92,7 +93,7 @@ pub fn check_checkpoint(path: &Path) -> Result<()> {
 }
 
 /// A tensor of the training state.
-pub(super) struct State<'a> {
+pub(super) struct StateTensor<'a> {
     pub(super) name: String,
     pub(super) shape: Vec<usize>,
     buffer: SliceMut<'a, f32>,
@@ -100,7 +101,7 @@ pub(super) struct State<'a> {
     batches: Option<Batches>,
 }
 
-impl State<'_> {
+impl StateTensor<'_> {
     fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
         if let Some(batches) = self.batches {
             return batches.read(gpu, self.buffer.as_slice());
@@ -125,7 +126,7 @@ impl Trainer {
     /// The file cannot be written, or the device was lost.
     pub fn save_checkpoint(&mut self, path: &Path) -> Result<()> {
         let gpu = self.gpu.clone();
-        let mut header = Header {
+        let mut header = CheckpointHeader {
             format: FORMAT.to_owned(),
             step: self.step,
             config: self.config.to_toml()?,
@@ -138,10 +139,10 @@ impl Trainer {
         for (name, _, values) in &downloads {
             self.refuse_values(name, values)?;
         }
-        let own = downloads.iter().map(|tensor| (tensor.0.clone(), tensor));
+        let current = downloads.iter().map(|tensor| (tensor.0.clone(), tensor));
         let best =
             self.convergence.best.iter().map(|tensor| (format!("{BEST}{}", tensor.0), tensor));
-        let named: Vec<(String, &Tensor)> = own.chain(best).collect();
+        let named: Vec<(String, &Tensor)> = current.chain(best).collect();
         let mut visits = gpu.read(&self.model.visit_counts)?;
         visits.truncate(self.model.count());
         let tensors =
@@ -197,7 +198,7 @@ impl Trainer {
         let damaged = |problem: String| {
             Error::input(path, format!("is not an intact checkpoint ({problem})"))
         };
-        let file = TensorFile::of(&bytes).map_err(|error| damaged(error.to_string()))?;
+        let file = TensorFile::parse(&bytes).map_err(|error| damaged(error.to_string()))?;
         let (header, begun) = self.header_of(path, &file)?;
         let visits: Vec<u32> = values(&file, VISIT_COUNTS, Dtype::U32, None).map_err(damaged)?;
         let gpu = self.gpu.clone();
@@ -232,14 +233,18 @@ impl Trainer {
     }
 
     /// The header and settings of a checkpoint that this run can resume from.
-    fn header_of(&self, path: &Path, file: &TensorFile<'_>) -> Result<(Header, TrainConfig)> {
+    fn header_of(
+        &self,
+        path: &Path,
+        file: &TensorFile<'_>,
+    ) -> Result<(CheckpointHeader, TrainConfig)> {
         let refused = |problem: String| Error::input(path, problem);
         let anew = "start again with --overwrite";
         let header = file.note(HEADER).and_then(|header| serde_json::from_str(header).ok());
-        let Some(header) = header.filter(|h: &Header| h.format == FORMAT) else {
+        let Some(header) = header.filter(|h: &CheckpointHeader| h.format == FORMAT) else {
             return Err(refused(format!("is not a `{FORMAT}`; {anew}")));
         };
-        let Header { step, config, dataset, .. } = &header;
+        let CheckpointHeader { step, config, dataset, .. } = &header;
         let config = TrainConfig::from_toml(config)
             .map_err(|error| refused(format!("was made by another version ({error}); {anew}")))?;
         if let Some(difference) = config.difference(&self.config) {
@@ -299,10 +304,10 @@ impl Trainer {
         &mut self,
         gpu: &Gpu,
         file: &TensorFile<'_>,
-        header: &Header,
+        header: &CheckpointHeader,
         damaged: &dyn Fn(String) -> Error,
     ) -> Result<()> {
-        let read = |state: State<'_>| {
+        let read = |state: StateTensor<'_>| {
             let values: Vec<f32> =
                 values(file, &state.name, Dtype::F32, Some(&state.shape)).map_err(damaged)?;
             if values.iter().all(|value: &f32| value.is_finite()) {
@@ -321,9 +326,9 @@ impl Trainer {
     }
 
     /// The state that the next step depends on, except the visit counts, which are integers.
-    pub(super) fn state(&mut self) -> Vec<State<'_>> {
+    pub(super) fn state(&mut self) -> Vec<StateTensor<'_>> {
         let trained = self.model.trained_planes(&self.gpu);
-        let Model { gaussians, moments, grad_norm_sums, .. } = &mut self.model;
+        let TrainedModel { gaussians, moments, grad_norm_sums, .. } = &mut self.model;
         let layout = gaussians.layout;
         let of_parameters =
             (vec![layout.words(), layout.count], layout.parameter_batches(&self.gpu));
@@ -331,19 +336,19 @@ impl Trainer {
         let name = "density.grad_norm_sums".to_owned();
         let shape = vec![layout.count];
         let buffer = grad_norm_sums.slice_mut();
-        let mut state = vec![State { name, shape, buffer, batches: None }];
+        let mut state = vec![StateTensor { name, shape, buffer, batches: None }];
         let (parameters, moments) = (gaussians.parameters.slice_mut(), moments.slice_mut());
         state.extend(optimized("gaussians", parameters, moments).enumerate().map(
-            |(place, (name, buffer))| {
-                let (shape, batches) = if place == 0 { &of_parameters } else { &of_moments };
-                State { name, shape: shape.clone(), buffer, batches: Some(*batches) }
+            |(plane, (name, buffer))| {
+                let (shape, batches) = if plane == 0 { &of_parameters } else { &of_moments };
+                StateTensor { name, shape: shape.clone(), buffer, batches: Some(*batches) }
             },
         ));
         for learnable in self.supervision.learnables() {
             let name = learnable.name();
             let AdamBuffers { parameters, moments, .. } = learnable.buffers();
             let shape = vec![parameters.len()];
-            state.extend(optimized(name, parameters, moments).map(|(name, buffer)| State {
+            state.extend(optimized(name, parameters, moments).map(|(name, buffer)| StateTensor {
                 name,
                 shape: shape.clone(),
                 buffer,
@@ -355,9 +360,9 @@ impl Trainer {
         {
             let (numbers, moments) = (lamp.numbers.slice_mut(), learning.moments.slice_mut());
             state.extend(optimized(LEARNED, numbers, moments).enumerate().map(
-                |(place, (name, buffer))| {
-                    let len = if place == 0 { LAMP_NUMBERS } else { LAMP_WIDTH };
-                    State { name, shape: vec![len as usize], buffer, batches: None }
+                |(plane, (name, buffer))| {
+                    let len = if plane == 0 { LAMP_NUMBERS } else { LAMP_WIDTH };
+                    StateTensor { name, shape: vec![len as usize], buffer, batches: None }
                 },
             ));
         }

@@ -34,7 +34,7 @@ use crate::splats::optimizer::Schedule;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::init::Initialization;
-use crate::splats::scene::{Facts, MAX_SH_DEGREE, Shape};
+use crate::splats::scene::{MAX_SH_DEGREE, ModelFacts, Shape};
 use crate::{Error, Result};
 
 pub use antialiasing::AntialiasingConfig;
@@ -381,17 +381,17 @@ impl TrainConfig {
     }
 
     /// What the file of a model of this configuration states, in the world of its training frame.
-    pub(crate) fn facts(&self, frame: &TrainingFrame) -> Facts {
+    pub(crate) fn facts(&self, frame: &TrainingFrame) -> ModelFacts {
         let RenderSettings { near, max_alpha, raw_colors, antialiased, .. } =
             self.render_settings();
         let near = (f64::from(near) / frame.scale) as f32;
-        Facts {
+        ModelFacts {
             // The unit of some worlds is too large or too small for the number.
             near: Some(near).filter(|near| near.is_normal()),
             max_alpha: Some(max_alpha),
             raw_colors: Some(raw_colors),
             antialiased,
-            ..Facts::default()
+            ..ModelFacts::default()
         }
     }
 

@@ -6,7 +6,7 @@ use super::TrainConfig;
 use crate::camera::Camera;
 use crate::photographs::dataset::Dataset;
 use crate::photographs::dataset::block::{Block, Cell};
-use crate::splats::joined::{MANIFEST, Manifest};
+use crate::splats::joined::{MANIFEST, TileManifest};
 use crate::splats::scene::Gaussians;
 use crate::{Error, Result};
 
@@ -26,21 +26,21 @@ pub(super) struct Initial {
 impl Initial {
     /// The Gaussians of [`TrainConfig::init`], divided by the halo of the dataset's block if it is one. A model in
     /// tiles is read one tile after the other.
-    pub(super) fn of(config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
+    pub(super) fn load(config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
         let Some(path) = &config.init else { return Ok(Self::default()) };
         let files = match path.join(MANIFEST).is_file() {
-            true => Manifest::load(path)?.files(),
+            true => TileManifest::load(path)?.files(),
             false => vec![path.clone()],
         };
         let block = Block::at(&dataset.root)?.filter(|block| block.halo != Cell::WORLD);
         let cameras: Vec<Camera> = dataset.train_views().map(|view| view.camera).collect();
         let mut initial = Self::default();
         for file in files {
-            let mut own = config.initial_model(&file)?;
+            let mut model = config.initial_model(&file)?;
             if let Some(Block { halo, .. }) = &block {
-                Gaussians::add(&mut initial.context, around(&mut own, halo, &cameras));
+                Gaussians::add(&mut initial.context, around(&mut model, halo, &cameras));
             }
-            Gaussians::add(&mut initial.gaussians, own);
+            Gaussians::add(&mut initial.gaussians, model);
         }
         match (&block, &initial.gaussians) {
             (Some(Block { id, .. }), None) => {
@@ -57,7 +57,7 @@ impl Initial {
     pub(super) fn of_restored(config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
         match Block::at(&dataset.root)? {
             None => Ok(Self::default()),
-            Some(_) => Ok(Self { gaussians: None, ..Self::of(config, dataset)? }),
+            Some(_) => Ok(Self { gaussians: None, ..Self::load(config, dataset)? }),
         }
     }
 }

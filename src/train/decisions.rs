@@ -13,7 +13,7 @@ const PATIENCE: usize = 4;
 
 /// The state before a round of density control.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-struct Round {
+struct RecordedRound {
     step: u64,
     /// The score of the held-out views in thousandths of a dB, an integer to be exact in files.
     score: i64,
@@ -22,7 +22,7 @@ struct Round {
 
 /// The score of the held-out views after a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Score {
+pub(super) struct HeldOutScore {
     pub(super) step: u64,
     /// Their mean PSNR in thousandths of a dB.
     pub(super) score: i64,
@@ -32,14 +32,14 @@ pub(super) struct Score {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub(super) struct Decisions {
-    rounds: Vec<Round>,
+    rounds: Vec<RecordedRound>,
     /// The number of Gaussians when growth ended.
     gaussians: Option<usize>,
     /// The highest degree that gained enough.
     pub(super) sh_degree: Option<u32>,
     /// Every score of the held-out views so far.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub(super) scores: Vec<Score>,
+    pub(super) scores: Vec<HeldOutScore>,
     /// The step at which the run converged; it then cools down and ends.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) converged: Option<u64>,
@@ -63,7 +63,8 @@ impl Decisions {
     fn gains_too_little(&self, growth_gain: f64) -> bool {
         let Some(before) = self.rounds.len().checked_sub(PATIENCE) else { return false };
         let (before, since) = self.rounds.split_at(before);
-        let best = |rounds: &[Round]| rounds.iter().max_by_key(|round| round.score).copied();
+        let best =
+            |rounds: &[RecordedRound]| rounds.iter().max_by_key(|round| round.score).copied();
         let (Some(before), Some(since), Some(last)) = (best(before), best(since), since.last())
         else {
             return false;
@@ -109,7 +110,7 @@ impl Trainer {
             let psnr = if is_scored { None } else { self.held_out_psnr()? };
             if let Some(psnr) = psnr {
                 let (step, gaussians) = (self.step, self.model.count());
-                self.convergence.decisions.rounds.push(Round {
+                self.convergence.decisions.rounds.push(RecordedRound {
                     step,
                     score: (1e3 * psnr).round() as i64,
                     gaussians,
@@ -167,7 +168,7 @@ mod tests {
     use super::*;
 
     fn decisions(rounds: &[(i64, usize)]) -> Decisions {
-        let round = |(i, &(score, gaussians)): (usize, &(i64, usize))| Round {
+        let round = |(i, &(score, gaussians)): (usize, &(i64, usize))| RecordedRound {
             step: 100 * i as u64,
             score,
             gaussians,

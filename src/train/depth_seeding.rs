@@ -6,7 +6,7 @@
 
 use glam::{DVec2, DVec3, Vec3};
 
-use super::model::Model;
+use super::model::TrainedModel;
 use super::patches::put_together;
 use super::views::TrainView;
 use super::{Trainer, streams};
@@ -87,7 +87,7 @@ impl Trainer {
         let filled = joined(&old, &picked, &self.config.start)?;
         let (in_use, frozen_columns) = (self.model.shape().sh_degree, self.config.frozen_columns());
         let precision = &self.config.precision;
-        self.model = Model::upload(&self.gpu, &filled, in_use, precision, frozen_columns)?;
+        self.model = TrainedModel::upload(&self.gpu, &filled, in_use, precision, frozen_columns)?;
         Ok(())
     }
 
@@ -119,14 +119,14 @@ impl Trainer {
             let neutral = exposure.map(Affine::inverse).map(|inverse| inverse.applied(&target));
             let target = neutral.unwrap_or(target).resized(camera.width, camera.height);
             let mask = self.mask_of(view)?.map(|mask| mask.resized(camera.width, camera.height));
-            let mut own = seen(&camera, &depths, &target, mask.as_ref());
+            let mut samples = seen(&camera, &depths, &target, mask.as_ref());
             if let Some(lamp) = &lamp {
-                for sample in &mut own {
+                for sample in &mut samples {
                     let in_view = camera.view_from_world.transform_point3(sample.position);
                     sample.color = lamp.unlit(sample.color, in_view);
                 }
             }
-            depth_samples.extend(own);
+            depth_samples.extend(samples);
         }
         Ok(depth_samples)
     }
@@ -170,8 +170,8 @@ impl Trainer {
 
 /// The camera with about `pixels` pixels, if it has more.
 fn coarse(camera: &Camera, pixels: usize) -> Camera {
-    let own = f64::from(camera.width) * f64::from(camera.height);
-    let scale = (pixels as f64 / own).sqrt().min(1.0);
+    let camera_pixels = f64::from(camera.width) * f64::from(camera.height);
+    let scale = (pixels as f64 / camera_pixels).sqrt().min(1.0);
     let side = |side: u32| ((f64::from(side) * scale).round() as u32).max(1);
     camera.resized(side(camera.width), side(camera.height))
 }
@@ -205,19 +205,19 @@ fn joined(old: &Gaussians, new: &[DepthSample], start: &Initialization) -> Resul
     let features = old.shape.features.width();
     for AttributePlane { column, width, .. } in planes(features, width(old.shape)) {
         let (from, to) = (column * old.count, column * all.count);
-        let own = &old.parameters[from..from + width * old.count];
-        all.parameters[to..to + own.len()].copy_from_slice(own);
+        let old_values = &old.parameters[from..from + width * old.count];
+        all.parameters[to..to + old_values.len()].copy_from_slice(old_values);
     }
     if features > 0 {
         let nearest = |depth_sample: &DepthSample| {
             let distance = |i: &usize| positions[*i].distance_squared(depth_sample.position);
             (0..old.count).min_by(|a, b| distance(a).total_cmp(&distance(b)))
         };
-        let own = all.features_mut();
+        let all_features = all.features_mut();
         for (i, nearest) in new.iter().map(nearest).enumerate() {
             let Some(nearest) = nearest else { continue };
             let from = features * nearest;
-            own.copy_within(from..from + features, features * (old.count + i));
+            all_features.copy_within(from..from + features, features * (old.count + i));
         }
     }
     Ok(all)

@@ -30,10 +30,10 @@ use crate::photographs::targets::SceneTone;
 use crate::photographs::tone::{Exposure, MeasuredPhotograph, ToneSettings, is_black};
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
-use geometry::Shared;
+use geometry::SceneGeometry;
 pub(super) use geometry::exposures_at_points;
 pub use lamp::LampDiagnosis;
-pub use noise::Noise;
+pub use noise::ChannelNoise;
 use photograph::PhotographStatistics;
 pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
 pub use target_noise::TargetNoise;
@@ -71,7 +71,7 @@ pub struct ViewDiagnosis {
     /// The number of different values.
     pub code_values: usize,
     /// `None` if no part is flat and unclipped.
-    pub noise: Option<Noise>,
+    pub noise: Option<ChannelNoise>,
     /// In the target, including quantisation and JPEG artefacts; `None` for a black or tiny photograph.
     pub noise_in_target: Option<TargetNoise>,
     /// The blur of the edges, as a standard deviation in pixels; `None` without edges.
@@ -113,7 +113,7 @@ pub struct SceneDiagnosis {
     pub zero_fraction: f64,
     pub code_values: f64,
     /// Fitted to the patches of all views.
-    pub noise: Option<Noise>,
+    pub noise: Option<ChannelNoise>,
     /// The medians over the views.
     pub noise_in_target: Option<TargetNoise>,
     /// The noise left in a target after averaging the views of a point, as a standard deviation of encoded values.
@@ -160,19 +160,19 @@ impl Diagnosis {
     /// Loads a dataset and diagnoses its training photographs, as stored, while they are decoded.
     pub fn load(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
         let looked_at = Mutex::new(HashMap::new());
-        let look = |name: &str, image: &Image, mask: Option<&Mask>| {
-            let photograph = PhotographStatistics::of(image, mask);
+        let observe = |name: &str, image: &Image, mask: Option<&Mask>| {
+            let photograph = PhotographStatistics::new(image, mask);
             let mut looked_at = looked_at.lock().unwrap_or_else(PoisonError::into_inner);
             looked_at.insert(name.to_owned(), photograph);
         };
-        let dataset = Dataset::load_and_look(root, options, Some(&look))?;
+        let dataset = Dataset::load_observed(root, options, Some(&observe))?;
         let looked_at = looked_at.into_inner().unwrap_or_else(PoisonError::into_inner);
         let diagnosis = Self::with_photographs(&dataset, options, looked_at)?;
         Ok((dataset, diagnosis))
     }
 
     /// Diagnoses a loaded dataset, whose photographs are read again; `options` are those that it was loaded with.
-    pub fn of(dataset: &Dataset, options: &LoadOptions) -> Result<Self> {
+    pub fn new(dataset: &Dataset, options: &LoadOptions) -> Result<Self> {
         Self::with_photographs(dataset, options, HashMap::new())
     }
 
@@ -193,7 +193,7 @@ impl Diagnosis {
             })
         };
         let paths = views.iter().map(|(_, view)| path(view)).collect::<Result<Vec<_>>>()?;
-        let shared = Shared::of(dataset, &views)?;
+        let shared = SceneGeometry::measure(dataset, &views)?;
         let unknown = paths.iter().copied().filter(|file| !known.contains_key(&file.name));
         known.extend(read(&dataset.root, &files, unknown.collect(), options)?);
         let photographs = views.iter().filter_map(|(_, view)| known.remove(&view.name));
@@ -214,7 +214,7 @@ impl Diagnosis {
         let without_pose = without_pose(&paths, &files, dataset)?;
         let remarks = remarks(&diagnosed, &photographs, &views, &without_pose);
         let mut scene =
-            SceneDiagnosis::of(&diagnosed, photographs, &shared, &exposure, dataset.points.len());
+            SceneDiagnosis::new(&diagnosed, photographs, &shared, &exposure, dataset.points.len());
         // A pixel of a resized target averages this many pixels in each direction.
         let shrink = diagnosed.iter().map(|view| options.shrink(view.size[0], view.size[1]));
         scene.target_noise /= shrink.fold(1.0, f64::max);
@@ -227,7 +227,7 @@ impl Diagnosis {
             scene,
             views: diagnosed,
             depth_maps: views.iter().filter(|(_, view)| view.depth.is_some()).count(),
-            fingerprint: PlannedViews::of(dataset),
+            fingerprint: PlannedViews::new(dataset),
         })
     }
 
@@ -268,7 +268,7 @@ fn read(
         });
         photographs.extend(read.collect::<Result<Vec<_>>>()?);
     }
-    colours.say();
+    colours.log();
     Ok(photographs)
 }
 
@@ -286,11 +286,11 @@ impl PhotographStatistics {
         }
         let decoded = (&image, alpha.as_ref());
         let mask = Mask::over(&file.input, decoded, file.mask.as_ref(), invert_masks)?;
-        let mask = borders.hidden_too(mask, (image.width, image.height));
-        Ok(Self::of(&image, mask.as_ref()))
+        let mask = borders.hide_borders(mask, (image.width, image.height));
+        Ok(Self::new(&image, mask.as_ref()))
     }
 
-    fn diagnosis(&self, name: &str, shared: &Shared, index: usize) -> ViewDiagnosis {
+    fn diagnosis(&self, name: &str, shared: &SceneGeometry, index: usize) -> ViewDiagnosis {
         let MeasuredPhotograph { statistics, luminance, .. } = &self.encoded;
         let [p10, p90] = statistics.percentiles();
         ViewDiagnosis {
@@ -319,10 +319,10 @@ impl PhotographStatistics {
 }
 
 impl SceneDiagnosis {
-    fn of(
+    fn new(
         views: &[ViewDiagnosis],
         photographs: Vec<PhotographStatistics>,
-        shared: &Shared,
+        shared: &SceneGeometry,
         exposure: &Exposure,
         points: usize,
     ) -> Self {
@@ -332,7 +332,7 @@ impl SceneDiagnosis {
         let mean = |of: fn(&ViewDiagnosis) -> f64| {
             lit.iter().map(|view| of(view)).sum::<f64>() / lit.len().max(1) as f64
         };
-        let lamp = LampDiagnosis::of(&shared.observations, views.len());
+        let lamp = LampDiagnosis::new(&shared.observations, views.len());
         let measured = deviation(lit.iter().filter_map(|view| view.exposure));
         let light = mean(|view| view.light);
         Self {
@@ -371,7 +371,12 @@ fn darkening(light: f64) -> f64 {
 }
 
 /// The noise of a target at the mean light, averaged over the views of a point.
-fn target_noise(noise: Noise, light: f64, exposure: &Exposure, shared: &Shared) -> f64 {
+fn target_noise(
+    noise: ChannelNoise,
+    light: f64,
+    exposure: &Exposure,
+    shared: &SceneGeometry,
+) -> f64 {
     let encoded = f64::from(crate::photographs::image::srgb_from_linear(light as f32));
     let weight = exposure.weight();
     // The curve's slope at the photograph's mean; 1 without a curve.
@@ -428,24 +433,24 @@ fn remarks(
         let views = views.iter().enumerate().filter(|(index, _)| is(*index));
         views.map(|(_, view)| view.name.as_str()).collect()
     };
-    let mut say = |names: Vec<&str>, what: &str| {
+    let mut add_remark = |names: Vec<&str>, what: &str| {
         if !names.is_empty() {
             remarks.push(format!("{} {what}: {}", names.len(), named(names)));
         }
     };
-    say(names(&|index| views[index].is_black), "black, left out of training");
+    add_remark(names(&|index| views[index].is_black), "black, left out of training");
     let mut checksums = HashSet::new();
     let is_new: Vec<bool> = photographs.iter().map(|one| checksums.insert(one.checksum)).collect();
     let is_repeated = |index: usize| !is_new[index] && !views[index].is_black;
-    say(names(&is_repeated), "identical to another photograph");
+    add_remark(names(&is_repeated), "identical to another photograph");
     let blur = geometry::median(views.iter().filter_map(|view| view.blur).collect());
     let [times, more] = BLURRED;
     let is_blurred = |index: usize| {
         let blurs = views[index].blur.zip(blur);
         blurs.is_some_and(|(blur, median)| blur > times * median && blur > median + more)
     };
-    say(names(&is_blurred), "more blurred than the others");
-    say(without_pose.iter().map(String::as_str).collect(), "without a pose, not used");
+    add_remark(names(&is_blurred), "more blurred than the others");
+    add_remark(without_pose.iter().map(String::as_str).collect(), "without a pose, not used");
     let centers: Vec<_> = cameras.iter().map(|(_, view)| view.camera.center()).collect();
     if cameras.len() == 1 {
         remarks.push("one photograph gives no depth: other views will look wrong".to_owned());

@@ -38,8 +38,8 @@ impl TrainConfig {
     pub(crate) fn difference(&self, other: &Self) -> Option<String> {
         const ALSO: [&str; 5] = ["steps", "reference", "stop.every", "stop.gain", "stop.margin"];
         let values = [self, other].map(values);
-        let [own, others] = match &values {
-            [Ok(own), Ok(others)] => [own, others],
+        let [values_here, others] = match &values {
+            [Ok(values_here), Ok(others)] => [values_here, others],
             [Err(error), _] | [_, Err(error)] => {
                 return Some(format!("a setting that cannot be compared ({error})"));
             }
@@ -49,18 +49,18 @@ impl TrainConfig {
         };
         let is_lower_limit =
             |key: &String| key == "max_gaussians" && other.max_gaussians <= self.max_gaussians;
-        let keys = own.keys().chain(others.keys());
+        let keys = values_here.keys().chain(others.keys());
         let is_free = |key: &str| FREE.contains(&key) || ALSO.contains(&key);
         let mut keys = keys.filter(|key| !is_free(key) && !is_lower_limit(key));
-        keys.find(|&key| own.get(key) != others.get(key))
-            .map(|key| format!("{key} = {}, not {}", value(own, key), value(others, key)))
+        keys.find(|&key| values_here.get(key) != others.get(key))
+            .map(|key| format!("{key} = {}, not {}", value(values_here, key), value(others, key)))
     }
 
     /// A checksum of every setting that affects results.
     pub(crate) fn checksum(&self) -> Result<String> {
-        let own = self.clone().with_absolute_paths();
+        let config = self.clone().with_absolute_paths();
         let mut hasher = Hasher::default();
-        for (key, value) in values(&own)? {
+        for (key, value) in values(&config)? {
             if !FREE.contains(&key.as_str()) {
                 hasher.write(key.as_bytes());
                 hasher.write(value.to_string().as_bytes());

@@ -9,7 +9,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::best::Snapshot;
-use super::decisions::{Decisions, Score};
+use super::decisions::{Decisions, HeldOutScore};
 use super::target_views::TargetViews;
 use super::{TrainConfig, Trainer};
 use crate::Result;
@@ -149,7 +149,7 @@ impl Trainer {
         let _phase = tracing::info_span!("scoring").entered();
         let Some(psnr) = self.held_out_psnr()? else { return Ok(()) };
         let [_, whole] = self.config.schedule.resolution_steps;
-        let score = Score { step: self.step, score: (1e3 * psnr).round() as i64 };
+        let score = HeldOutScore { step: self.step, score: (1e3 * psnr).round() as i64 };
         let is_best = self.best_score().is_none_or(|best| score.score > best.score);
         if is_best && self.step >= whole {
             self.convergence.best = self.snapshot()?;
@@ -172,7 +172,7 @@ impl Trainer {
     }
 
     /// The first of the best scores since views have their full size; its model is kept.
-    fn best_score(&self) -> Option<Score> {
+    fn best_score(&self) -> Option<HeldOutScore> {
         let [_, whole] = self.config.schedule.resolution_steps;
         let scores = self.convergence.decisions.scores.iter().filter(|score| score.step >= whole);
         scores.copied().reduce(|best, next| if next.score > best.score { next } else { best })
@@ -191,7 +191,8 @@ impl Trainer {
         let step = self.step;
         let reason = self.converged().map_or(EndReason::Steps, |_| EndReason::Converged);
         let last = self.convergence.decisions.scores.last().filter(|last| last.step == step);
-        let lost = |best: &Score| last.map_or(0.0, |last| (best.score - last.score) as f64 / 1e3);
+        let lost =
+            |best: &HeldOutScore| last.map_or(0.0, |last| (best.score - last.score) as f64 / 1e3);
         let better = self.best_score().filter(|best| lost(best) > self.config.stop.margin);
         let best = std::mem::take(&mut self.convergence.best);
         if better.is_some() {

@@ -7,7 +7,7 @@ use crate::splats::lamp::Lamp;
 
 /// The tone curve of a lamp's colours; [`Lamp`] has its formula.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Encoding {
+pub(super) struct LampToneLaw {
     /// The target of no light.
     pub(super) black: f64,
     /// d ln(target - black) / d ln light near black.
@@ -16,7 +16,7 @@ pub(super) struct Encoding {
     pub(super) reach: f64,
 }
 
-impl Encoding {
+impl LampToneLaw {
     /// That of grey, fitted to the targets of all photographs together; light is linear.
     pub(super) fn measured(targets: &Targets) -> Result<Self> {
         /// The shares of the pixels that are darker than the greys that it is fitted to.
@@ -44,17 +44,17 @@ impl Encoding {
     }
 
     /// That which is nearest to (ln light, target above black) in the logarithm, by least squares.
-    fn fitted(black: f64, known: &[[f64; 2]]) -> Self {
+    fn fitted(black: f64, samples: &[[f64; 2]]) -> Self {
         /// The reaches that are tried, over the largest target: a curve beyond the last one is as good as a power.
         const REACHES: i32 = 24;
         /// Of a curve that is flat, and of one that is steeper than light.
         const SLOPES: [f64; 2] = [0.1, 2.0];
-        let largest = known.iter().fold(0.0_f64, |largest, own| largest.max(own[1]));
+        let largest = samples.iter().fold(0.0_f64, |largest, point| largest.max(point[1]));
         let reaches = (0..REACHES).map(|k| largest * (1.0 + 0.02 * 1.4_f64.powi(k)));
         let fit = |reach: f64| {
             let x =
                 |above: f64| if reach == 0.0 { above } else { -reach * (-above / reach).ln_1p() };
-            let points = known.iter().map(|&[light, above]| [light, x(above).ln()]);
+            let points = samples.iter().map(|&[light, above]| [light, x(above).ln()]);
             let (slope, residual) = line(&points.collect::<Vec<_>>());
             (residual, Self { black, slope, reach })
         };
@@ -62,17 +62,18 @@ impl Encoding {
         let best =
             all.filter(|(residual, _)| residual.is_finite()).min_by(|a, b| a.0.total_cmp(&b.0));
         let usual = Self { black, slope: Lamp::AT_CAMERA.slope, reach: 0.0 };
-        let own = best.map_or(usual, |(_, own)| own);
-        Self { slope: own.slope.clamp(SLOPES[0], SLOPES[1]), ..own }
+        let encoding = best.map_or(usual, |(_, encoding)| encoding);
+        Self { slope: encoding.slope.clamp(SLOPES[0], SLOPES[1]), ..encoding }
     }
 }
 
 /// The slope of the line of least squares through points, and the sum of its squared residuals.
 fn line(points: &[[f64; 2]]) -> (f64, f64) {
-    let mean = |axis: usize| points.iter().map(|own| own[axis]).sum::<f64>() / points.len() as f64;
+    let mean =
+        |axis: usize| points.iter().map(|point| point[axis]).sum::<f64>() / points.len() as f64;
     let middle = [0, 1].map(mean);
     let product = |a: usize, b: usize| {
-        points.iter().map(|own| (own[a] - middle[a]) * (own[b] - middle[b])).sum::<f64>()
+        points.iter().map(|point| (point[a] - middle[a]) * (point[b] - middle[b])).sum::<f64>()
     };
     let slope = product(0, 1) / product(0, 0);
     (slope, product(1, 1) - slope * product(0, 1))
@@ -90,17 +91,17 @@ mod tests {
             let target = |x: f64| if reach == 0.0 { x } else { reach * (1.0 - (-x / reach).exp()) };
             bent.map(|(light, x)| [light.ln(), target(x)]).collect::<Vec<_>>()
         };
-        let own = Encoding::fitted(0.07, &curve(0.8));
-        assert!((own.slope - 0.6).abs() < 0.02 && (own.reach - 0.8).abs() < 0.05, "{own:?}");
-        let power = Encoding::fitted(0.07, &curve(0.0));
+        let found = LampToneLaw::fitted(0.07, &curve(0.8));
+        assert!((found.slope - 0.6).abs() < 0.02 && (found.reach - 0.8).abs() < 0.05, "{found:?}");
+        let power = LampToneLaw::fitted(0.07, &curve(0.0));
         assert!((power.slope - 0.6).abs() < 1e-9 && power.reach == 0.0, "{power:?}");
     }
 
     #[test]
     fn a_curve_of_which_hardly_anything_is_known_has_the_slope_of_a_display() {
-        let usual = Encoding { black: 0.0, slope: Lamp::AT_CAMERA.slope, reach: 0.0 };
+        let usual = LampToneLaw { black: 0.0, slope: Lamp::AT_CAMERA.slope, reach: 0.0 };
         for known in [&[][..], &[[0.0, 0.5]], &[[0.0, 0.5], [0.0, 0.5]]] {
-            assert_eq!(Encoding::fitted(0.0, known), usual, "{known:?}");
+            assert_eq!(LampToneLaw::fitted(0.0, known), usual, "{known:?}");
         }
     }
 }

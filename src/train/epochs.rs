@@ -20,17 +20,17 @@ impl Epochs {
     /// The order of the epoch of a step, counted from 1, and the step's position in it.
     pub(super) fn of_step(&self, seed: u64, step: u64, view_count: usize) -> (Arc<[usize]>, usize) {
         let count = view_count as u64;
-        let (epoch, place) = ((step - 1) / count, (step - 1) % count);
+        let (epoch, position) = ((step - 1) / count, (step - 1) % count);
         let key = (seed, view_count, epoch);
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let known = kept.iter().find(|(known, _)| *known == key).map(|(_, order)| order.clone());
-        let order = known.unwrap_or_else(|| {
+        let cached = kept.iter().find(|(cached, _)| *cached == key).map(|(_, order)| order.clone());
+        let order = cached.unwrap_or_else(|| {
             let order: Arc<[usize]> = order(seed, view_count, epoch).into();
             kept.truncate(MAX_KEPT - 1);
             kept.push_front((key, Arc::clone(&order)));
             order
         });
-        (order, place as usize)
+        (order, position as usize)
     }
 }
 
@@ -54,9 +54,9 @@ mod tests {
         let epochs = Epochs::default();
         for epoch in 0..3_u64 {
             let taken = (0..7).map(|step| {
-                let (order, place) = epochs.of_step(5, 1 + 7 * epoch + step, 7);
+                let (order, position) = epochs.of_step(5, 1 + 7 * epoch + step, 7);
                 assert_eq!(order.as_ptr(), epochs.of_step(5, 1 + 7 * epoch, 7).0.as_ptr());
-                order[place]
+                order[position]
             });
             let mut taken: Vec<usize> = taken.collect();
             assert_eq!(taken, order(5, 7, epoch));

@@ -32,21 +32,23 @@ pub(crate) fn known_stops(
     const ALIKE: f64 = 0.01;
     let mut stops: BTreeMap<String, f64> = match table_of(dataset, config) {
         Some(path) => {
-            table::load(&path)?.into_iter().filter_map(|own| Some((own.name, own.ev?))).collect()
+            table::load(&path)?.into_iter().filter_map(|row| Some((row.name, row.ev?))).collect()
         }
         None => {
             let photographs = Dataset::photographs(&dataset.root, &config.load_options());
-            let stops = |own: &Photograph| Some((own.name.clone(), exposure_value(&own.input)?));
+            let stops = |photograph: &Photograph| {
+                Some((photograph.name.clone(), exposure_value(&photograph.input)?))
+            };
             photographs.unwrap_or_default().iter().filter_map(stops).collect()
         }
     };
     let training: Vec<f64> =
         dataset.train_views().filter_map(|view| stops.get(&view.name).copied()).collect();
     let mean = training.iter().sum::<f64>() / training.len().max(1) as f64;
-    if training.is_empty() || stops.values().all(|own| (own - mean).abs() < ALIKE) {
+    if training.is_empty() || stops.values().all(|stop| (stop - mean).abs() < ALIKE) {
         return Ok(BTreeMap::new());
     }
-    stops.values_mut().for_each(|own| *own -= mean);
+    stops.values_mut().for_each(|stop| *stop -= mean);
     Ok(stops)
 }
 
@@ -107,9 +109,9 @@ impl Views {
         path: &Path,
         dataset: &Dataset,
     ) -> Result<BTreeMap<String, InitialExposures>> {
-        let known = table::load(path)?;
+        let rows = table::load(path)?;
         let views: BTreeSet<&str> = dataset.views.iter().map(|view| view.name.as_str()).collect();
-        let names = known.iter().map(|known| known.name.as_str());
+        let names = rows.iter().map(|rows| rows.name.as_str());
         let unknown: Vec<&str> = names.filter(|name| !views.contains(name)).collect();
         if !unknown.is_empty() {
             let problem = format!(
@@ -118,32 +120,34 @@ impl Views {
             );
             return Err(Error::input(path, problem));
         }
-        let start = |known: table::KnownExposure| {
-            let stops = known.ev.map(InitialExposures::Stops);
-            Some((known.name, known.affine.map(InitialExposures::Affine).or(stops)?))
+        let start = |rows: table::KnownExposure| {
+            let stops = rows.ev.map(InitialExposures::Stops);
+            Some((rows.name, rows.affine.map(InitialExposures::Affine).or(stops)?))
         };
         let starts: BTreeMap<String, InitialExposures> =
-            known.into_iter().filter_map(start).collect();
+            rows.into_iter().filter_map(start).collect();
         let missing: Vec<&str> = self.names().filter(|name| !starts.contains_key(*name)).collect();
-        let place = path.display();
+        let file = path.display();
         if missing.is_empty() {
-            tracing::info!("initial exposures from {place}");
+            tracing::info!("initial exposures from {file}");
         } else {
             let names = missing.join(", ");
-            tracing::warn!("{place} lacks {names}: their exposures start at the identity");
+            tracing::warn!("{file} lacks {names}: their exposures start at the identity");
         }
         Ok(starts)
     }
 
     fn starts_of_points(&self, dataset: &Dataset) -> Result<BTreeMap<String, InitialExposures>> {
-        let known = exposures_at_points(dataset)?;
-        let own: BTreeMap<String, InitialExposures> = self
+        let exposures = exposures_at_points(dataset)?;
+        let starts: BTreeMap<String, InitialExposures> = self
             .names()
-            .filter_map(|name| Some((name.to_owned(), InitialExposures::Stops(*known.get(name)?))))
+            .filter_map(|name| {
+                Some((name.to_owned(), InitialExposures::Stops(*exposures.get(name)?)))
+            })
             .collect();
-        let (found, all) = (own.len(), self.names().count());
+        let (found, all) = (starts.len(), self.names().count());
         tracing::info!("initial exposures of {found} of {all} photographs from shared points");
-        Ok(own)
+        Ok(starts)
     }
 
     fn initial_exposures(
@@ -153,12 +157,14 @@ impl Views {
     ) -> Result<BTreeMap<String, InitialExposures>> {
         let photographs = Dataset::photographs(&dataset.root, options).unwrap_or_default();
         let names: BTreeSet<&str> = self.names().collect();
-        let own = photographs.iter().filter(|photograph| names.contains(photograph.name.as_str()));
+        let photographs_of_views =
+            photographs.iter().filter(|photograph| names.contains(photograph.name.as_str()));
         let start = |photograph: &Photograph| {
             let stops = exposure_value(&photograph.input)?;
             Some((photograph.name.clone(), InitialExposures::Stops(stops)))
         };
-        let starts: BTreeMap<String, InitialExposures> = own.filter_map(start).collect();
+        let starts: BTreeMap<String, InitialExposures> =
+            photographs_of_views.filter_map(start).collect();
         match starts.len() {
             0 => {}
             all if all == names.len() => {

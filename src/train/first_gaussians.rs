@@ -28,21 +28,25 @@ impl Views {
         config: &TrainConfig,
         frame: &TrainingFrame,
     ) -> Cow<'a, [Point]> {
-        let own = &dataset.points;
-        let wanted =
-            if own.is_empty() { config.random_points } else { config.density.sparse_threshold() };
-        let count = wanted.min(config.max_gaussians).saturating_sub(own.len());
+        let triangulated = &dataset.points;
+        let wanted = if triangulated.is_empty() {
+            config.random_points
+        } else {
+            config.density.sparse_threshold()
+        };
+        let count = wanted.min(config.max_gaussians).saturating_sub(triangulated.len());
         if count == 0 {
-            return own.into();
+            return triangulated.into();
         }
         let firsts = self.all().iter().filter(|view| view.patch.is_first());
         let cameras: Vec<Camera> = firsts.map(|view| view.patch.camera).collect();
         let seed = Stream::new(config.seed, streams::POINTS).bits(0);
-        let found = if own.is_empty() { "no".to_owned() } else { own.len().to_string() };
+        let found =
+            if triangulated.is_empty() { "no".to_owned() } else { triangulated.len().to_string() };
         tracing::info!("{found} points in the dataset; {count} random ones added");
         let point = |position| Point { position: frame.unframed(position), views: vec![] };
         let random = init::random(&cameras, count, seed).into_iter().map(point);
-        own.iter().cloned().chain(random).collect()
+        triangulated.iter().cloned().chain(random).collect()
     }
 
     /// One Gaussian for each point of the dataset, and for random points if there are few or none, with their colours
@@ -71,7 +75,7 @@ impl Views {
             let target = targets.next(photograph)?;
             let exposure = exposures.and_then(|exposures| exposures.get(photograph.0));
             let mut target =
-                exposure.map_or_else(|| target.clone(), |own| own.inverse().applied(&target));
+                exposure.map_or_else(|| target.clone(), |affine| affine.inverse().applied(&target));
             if let Some(lamp) = lamp {
                 let shown = |value: f32| lamp.tone_inverse(value.into()) as f32;
                 target.data.iter_mut().for_each(|value| *value = shown(*value));
@@ -94,7 +98,7 @@ impl Views {
                     kept,
                     &dataset.views,
                     |_, _| 1.0,
-                    |index| photographs[index].map(|own| dark.next(own)).transpose(),
+                    |index| photographs[index].map(|affine| dark.next(affine)).transpose(),
                 )?
             } else {
                 vec![]
@@ -191,10 +195,10 @@ fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
         channels.map(|channel| channel - COLOR_CHANNELS)
     };
     let width = features.width();
-    for (i, own) in gaussians.features_mut().chunks_mut(width.max(1)).enumerate() {
-        places(Feature::Structure).for_each(|at| own[at] = 0.0);
+    for (i, of_gaussian) in gaussians.features_mut().chunks_mut(width.max(1)).enumerate() {
+        places(Feature::Structure).for_each(|at| of_gaussian[at] = 0.0);
         for (channel, at) in places(Feature::Illumination).enumerate() {
-            own[at] = (low[i][channel] / colors[i][channel].max(DARKEST)).clamp(0.0, 1.0);
+            of_gaussian[at] = (low[i][channel] / colors[i][channel].max(DARKEST)).clamp(0.0, 1.0);
         }
     }
 }

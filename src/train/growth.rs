@@ -185,7 +185,7 @@ mod tests {
         losses.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap()
     }
 
-    fn of(preset: Preset, dataset: &Path, seed: u64) -> TrainConfig {
+    fn growth_config(preset: Preset, dataset: &Path, seed: u64) -> TrainConfig {
         let mut config =
             TrainConfig { dataset: dataset.to_owned(), seed, ..TrainConfig::default() };
         preset.apply(&mut config).unwrap();
@@ -204,7 +204,7 @@ mod tests {
                 ..SyntheticOptions::default()
             };
             synthetic::write(folder.path(), &options).unwrap();
-            let mut config = of(Preset::Fast, folder.path(), seed);
+            let mut config = growth_config(Preset::Fast, folder.path(), seed);
             config.schedule.densify_interval = 50;
             let (step, lost) = worst(&config);
             assert!(lost <= BOUND, "seed {seed}, step {step}: {lost} dB");
@@ -222,7 +222,8 @@ mod tests {
         for scene in scenes.split(',').map(PathBuf::from) {
             for downscale in sizes.split(',').map(|size| size.parse().unwrap()) {
                 for seed in seeds.split(',').map(|seed| seed.parse().unwrap()) {
-                    let config = TrainConfig { downscale, ..of(Preset::Balanced, &scene, seed) };
+                    let config =
+                        TrainConfig { downscale, ..growth_config(Preset::Balanced, &scene, seed) };
                     let (step, lost) = worst(&config);
                     let line = format!(
                         "{} / {downscale}, seed {seed}: {lost:.3} dB at step {step}",

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use glam::DVec3;
 
 use super::LampRates;
-use super::encoding::Encoding;
+use super::encoding::LampToneLaw;
 use super::{Optimizer, TrainConfig, Trainer};
 use crate::Result;
 use crate::gpu::{Gpu, Recorder, Slice, SliceMut};
@@ -118,8 +118,9 @@ pub(super) fn start(targets: &Targets, dataset: &Dataset, config: &TrainConfig) 
     }
     let scale = config.frame.unwrap_or_default().scale;
     let points = in_views(dataset);
-    let own = points.values().map(|points| points.iter().map(|point| point.length()).collect());
-    let distances: Vec<Vec<f64>> = own.collect();
+    let distances_of_points =
+        points.values().map(|points| points.iter().map(|point| point.length()).collect());
+    let distances: Vec<Vec<f64>> = distances_of_points.collect();
     if config.exposure.learn && spread(&distances) < LEAST_SPREAD {
         tracing::warn!(
             "all views are at about the same distance from what they show: exposures of views can take the lamp's \
@@ -128,7 +129,7 @@ pub(super) fn start(targets: &Targets, dataset: &Dataset, config: &TrainConfig) 
     }
     let all = distances.into_iter().flatten().collect();
     let reference_distance = median(all).unwrap_or_else(|| config.extent_of(dataset));
-    let Encoding { black, slope, reach } = Encoding::measured(targets)?;
+    let LampToneLaw { black, slope, reach } = LampToneLaw::measured(targets)?;
     let lamp = Lamp {
         ambient: config.lamp.ambient,
         exponent: config.lamp.exponent,
@@ -162,7 +163,7 @@ fn in_views(dataset: &Dataset) -> BTreeMap<usize, Vec<DVec3>> {
     let mut in_views = BTreeMap::<usize, Vec<DVec3>>::new();
     for point in points.iter().step_by(stride) {
         let training = views.iter().enumerate().filter(|(_, view)| view.is_train());
-        for (index, view) in training.filter(|own| is_seen(point, *own)) {
+        for (index, view) in training.filter(|view| is_seen(point, *view)) {
             let in_view = view.camera.view_from_world.transform_point3(point.position);
             in_views.entry(index).or_default().push(in_view);
         }
@@ -172,11 +173,12 @@ fn in_views(dataset: &Dataset) -> BTreeMap<usize, Vec<DVec3>> {
 
 /// The standard deviation of the logarithm of the views' median distances.
 fn spread(distances: &[Vec<f64>]) -> f64 {
-    let own = distances.iter().filter_map(|own| Some(median(own.clone())?.ln()));
-    let own: Vec<f64> = own.collect();
+    let logarithms =
+        distances.iter().filter_map(|logarithms| Some(median(logarithms.clone())?.ln()));
+    let logarithms: Vec<f64> = logarithms.collect();
     let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
-    let middle = mean(&own);
-    mean(&own.iter().map(|value| (value - middle).powi(2)).collect::<Vec<_>>()).sqrt()
+    let middle = mean(&logarithms);
+    mean(&logarithms.iter().map(|value| (value - middle).powi(2)).collect::<Vec<_>>()).sqrt()
 }
 
 fn median(mut values: Vec<f64>) -> Option<f64> {

@@ -86,11 +86,11 @@ impl SettingsLayer {
                 format!("`{assignment}` has no value; write KEY=VALUE, as in tone.alpha=0.1");
             Error::Usage(problem)
         })?;
-        self.say(key.trim(), value.trim(), Origin::Set)
+        self.set_text(key.trim(), value.trim(), Origin::Set)
     }
 
     /// Adds a setting with a value as on a command line: TOML, or text without quotes.
-    pub fn say(&mut self, key: &str, text: &str, origin: Origin) -> Result<()> {
+    pub fn set_text(&mut self, key: &str, text: &str, origin: Origin) -> Result<()> {
         let value = value(text);
         // A device may be named 0.
         let is_text = setting(key).is_some_and(|row| row.rule.is_text());
@@ -120,7 +120,7 @@ impl SettingsLayer {
     }
 
     /// Every setting of a configuration.
-    fn of(config: &TrainConfig) -> Result<Self> {
+    fn from_config(config: &TrainConfig) -> Result<Self> {
         let table = Table::try_from(config).map_err(|error| Error::Usage(error.to_string()))?;
         let values = flat("", table).into_iter();
         Ok(Self(values.map(|(key, value)| (key, value, Origin::Default)).collect()))
@@ -139,7 +139,7 @@ impl SettingsLayer {
 
     /// The value of a setting.
     pub fn get(&self, key: &str) -> Option<&Value> {
-        self.0.iter().rev().find_map(|(own, value, _)| (own == key).then_some(value))
+        self.0.iter().rev().find_map(|(name, value, _)| (name == key).then_some(value))
     }
 }
 
@@ -164,7 +164,7 @@ impl Settings {
 
     fn set(&mut self, key: &str, value: Value, origin: Origin) {
         let (mut key, mut value) = (key, value);
-        let is_another = self.0.get(key).is_none_or(|(own, _)| *own != value);
+        let is_another = self.0.get(key).is_none_or(|(current, _)| *current != value);
         match key {
             "tone.curve" if is_another => {
                 self.0.retain(|key, _| {
@@ -292,7 +292,7 @@ impl TrainConfig {
     /// The configuration with the settings of a layer.
     pub(super) fn overlaid(&self, layer: &SettingsLayer) -> Result<Self> {
         let mut settings = Settings::default();
-        settings.merge(&SettingsLayer::of(self)?);
+        settings.merge(&SettingsLayer::from_config(self)?);
         settings.merge(layer);
         let config = settings.config()?;
         Ok(Self { spool: self.spool.clone(), ..config })
@@ -301,7 +301,11 @@ impl TrainConfig {
 
 /// The values in a configuration's TOML, by key.
 pub fn values(config: &TrainConfig) -> Result<BTreeMap<String, Value>> {
-    Ok(SettingsLayer::of(config)?.0.into_iter().map(|(key, value, _)| (key, value)).collect())
+    Ok(SettingsLayer::from_config(config)?
+        .0
+        .into_iter()
+        .map(|(key, value, _)| (key, value))
+        .collect())
 }
 
 /// A whole number, also in short forms: 5000, 5k, 1e4, 1.5M.
@@ -328,7 +332,9 @@ fn line_of(text: &str, key: &str) -> Option<String> {
     let document = DeTable::parse(text).ok()?;
     let (mut table, mut at) = (document.get_ref(), None);
     for name in key.split('.') {
-        let Some((name, value)) = table.iter().find(|(own, _)| own.get_ref() == name) else {
+        let Some((name, value)) =
+            table.iter().find(|(name_in_file, _)| name_in_file.get_ref() == name)
+        else {
             break;
         };
         at = Some(name.span().start);

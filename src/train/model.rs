@@ -15,7 +15,7 @@ impl Trainer {
     /// The gradients of all parameters in the last step, in the frame.
     #[cfg(feature = "testing")]
     pub fn gradients(&self) -> Result<Gaussians> {
-        let Model { gaussians, gradients, .. } = &self.model;
+        let TrainedModel { gaussians, gradients, .. } = &self.model;
         let parameters = self.model.trained_planes(&self.gpu).read(&self.gpu, gradients)?;
         let Layout { count, shape, .. } = gaussians.layout;
         Ok(Gaussians { count, shape, parameters, origin: gaussians.origin })
@@ -33,7 +33,7 @@ impl Trainer {
 ///
 /// SH coefficients of a degree have memory, and passes over it, only once the degree is in use.
 #[derive(Debug)]
-pub(super) struct Model {
+pub(super) struct TrainedModel {
     pub(super) gaussians: DeviceGaussians,
     /// Adam's moments.
     pub(super) moments: Moments,
@@ -47,7 +47,7 @@ pub(super) struct Model {
     pub(super) visit_counts: Buffer<u32>,
 }
 
-impl Model {
+impl TrainedModel {
     /// Uploads Gaussians with memory for the SH degree `in_use`, or for their own degree if that is higher.
     pub(super) fn upload(
         gpu: &Gpu,
@@ -64,7 +64,7 @@ impl Model {
         Ok(Self {
             sh_degree,
             frozen_columns,
-            moments: Moments::of(precision.moments, |name| batches.zeros(gpu, name))?,
+            moments: Moments::new(precision.moments, |name| batches.zeros(gpu, name))?,
             gradients: batches.zeros(gpu, "gradients")?,
             grad_norm_sums: gpu.zeros("grad_norm_sums", count)?,
             visit_counts: gpu.zeros("visit_counts", count)?,
@@ -106,10 +106,10 @@ impl Model {
 
     /// Changes the SH degree; coefficients beyond it are dropped with their moments.
     pub(super) fn set_sh_degree(&mut self, gpu: &Gpu, sh_degree: u32) -> Result<()> {
-        let own = self.gaussians.layout;
-        let new = Layout { shape: Shape { sh_degree, ..own.shape }, ..own };
+        let old = self.gaussians.layout;
+        let new = Layout { shape: Shape { sh_degree, ..old.shape }, ..old };
         // Grows one buffer after the other, keeping contents and capacity.
-        let all = Layout { count: own.capacity, ..new };
+        let all = Layout { count: old.capacity, ..new };
         lengthen(gpu, &mut self.gaussians.parameters, all.parameter_batches(gpu))?;
         let trained = all.batches(gpu).without(self.frozen_columns);
         self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, trained))?;
@@ -119,7 +119,7 @@ impl Model {
         let planes = planes.collect::<Result<Vec<_>>>()?;
 
         self.gaussians.layout = new;
-        let (count, shape, origin) = (own.count, own.shape, self.gaussians.origin);
+        let (count, shape, origin) = (old.count, old.shape, self.gaussians.origin);
         let resized = |parameters| {
             Gaussians { count, shape, parameters, origin }.with_sh_degree(sh_degree).parameters
         };
@@ -276,7 +276,8 @@ mod tests {
     fn another_sh_degree_keeps_the_moments_of_the_columns_that_are_trained() {
         let gpu = gpu();
         let given = Gaussians::zeros(7, Shape { sh_degree: 3, features: Features::NONE });
-        let mut model = Model::upload(&gpu, &given, 1, &PrecisionConfig::default(), 11).unwrap();
+        let mut model =
+            TrainedModel::upload(&gpu, &given, 1, &PrecisionConfig::default(), 11).unwrap();
         // The last float of a frozen column is in the first vector of four.
         let (frozen, in_vectors) = (7 * 11, 7 * 11 / 4 * 4);
         let columns = [14 + 9, 14 + 24];
@@ -305,7 +306,7 @@ mod tests {
             let mut given = Gaussians::zeros(10, shape);
             // Degree 3 is not in use, so there is no memory for it.
             given.parameters[..140].fill(0.5);
-            let mut model = Model::upload(&gpu, &given, 0, &precision, 0).unwrap();
+            let mut model = TrainedModel::upload(&gpu, &given, 0, &precision, 0).unwrap();
             assert_eq!(model.gaussians.parameters.len(), 140);
             model.set_sh_degree(&gpu, 2).unwrap();
             assert_eq!(model.gaussians.parameters.len(), 10 * model.gaussians.layout.words());

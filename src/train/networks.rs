@@ -122,7 +122,9 @@ impl Networks {
 
     /// Whether the device can bind the feature maps of a view of `size`.
     pub(super) fn fits(&self, size: UVec2) -> bool {
-        self.denoiser.as_ref().is_none_or(|own| Denoiser::fits_on(&self.gpu, own.settings(), size))
+        self.denoiser
+            .as_ref()
+            .is_none_or(|denoiser| Denoiser::fits_on(&self.gpu, denoiser.settings(), size))
             && (self.tonemapper.is_none() || Tonemapper::fits_on(&self.gpu, size))
     }
 

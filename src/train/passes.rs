@@ -14,7 +14,7 @@ use crate::splats::scene::Shape;
 use crate::splats::smoothing::SmoothingFloor;
 
 /// Kernels that depend only on the device and the settings.
-pub(super) struct Kernels {
+pub(super) struct TrainKernels {
     pub(super) renderer: Renderer,
     pub(super) losses: Losses,
     pub(super) adam: Adam,
@@ -23,14 +23,14 @@ pub(super) struct Kernels {
     pub(super) densifier: Densifier,
 }
 
-impl Kernels {
+impl TrainKernels {
     pub(super) fn new(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
-        let (rest, own) = (config.precision.rest, config.render_settings());
-        let shape = Shape { sh_degree: first_sh_degree(config), ..own.shape };
+        let (rest, settings) = (config.precision.rest, config.render_settings());
+        let shape = Shape { sh_degree: first_sh_degree(config), ..settings.shape };
         Ok(Self {
             renderer: Renderer::with_gradients(
                 gpu,
-                RenderSettings { rest, shape, ..own },
+                RenderSettings { rest, shape, ..settings },
                 GradientKind::on(gpu, [rest, config.precision.moments]),
                 config.frozen_columns(),
             )?,

@@ -64,11 +64,11 @@ impl Views {
     pub(super) fn log_patches(&self, gpu: &Gpu) {
         let mut cut = self.photographs().filter(|view| !view.patch.is_whole());
         let Some(TrainView { name, photograph, patch, .. }) = cut.next() else { return };
-        let own = self.whole().iter().filter(|view| view.photograph == *photograph).count();
+        let patch_count = self.whole().iter().filter(|view| view.photograph == *photograph).count();
         let (Camera { width, height, .. }, UVec2 { x, y }) = (patch.camera, patch.size);
         tracing::warn!(
             "{} of {} photographs are trained in patches, due to {} or patch_pixels: {name}, \
-             {width}x{height}, in {own} of about {x}x{y}",
+             {width}x{height}, in {patch_count} of about {x}x{y}",
             1 + cut.count(),
             self.photographs().count(),
             gpu.properties().name

@@ -173,7 +173,7 @@ impl Trainer {
         if !preset.is_planned() {
             return Self::new(gpu, config, dataset);
         }
-        let plan = planned(&Diagnosis::of(dataset, &diagnosed(&config))?, &config, gpu);
+        let plan = planned(&Diagnosis::new(dataset, &diagnosed(&config))?, &config, gpu);
         let mut dataset = dataset.clone();
         dataset.leave_out(&plan.left_out);
         Self::new(gpu, requested.settings(Some(&plan))?.config()?, &dataset)

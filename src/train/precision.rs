@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::Result;
 use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu};
-use crate::photographs::pseudo_gt::Encoded;
+use crate::photographs::pseudo_gt::EncodedPlanes;
 use crate::splats::packed_sh::StorageFormat;
 
 settings! {
@@ -70,8 +70,8 @@ impl Encoder {
         Self { gpu: gpu.clone(), bits, grids: [None, None] }
     }
 
-    pub(super) fn upload(&mut self, name: &str, values: &[f32]) -> Result<Encoded> {
-        let plain = |gpu: &Gpu| Encoded::plain(gpu, Arc::new(gpu.buffer(name, values)?));
+    pub(super) fn upload(&mut self, name: &str, values: &[f32]) -> Result<EncodedPlanes> {
+        let plain = |gpu: &Gpu| EncodedPlanes::plain(gpu, Arc::new(gpu.buffer(name, values)?));
         if self.bits == PhotographBits::Single {
             return plain(&self.gpu);
         }
@@ -113,7 +113,7 @@ impl Encoder {
         which: usize,
         palette: Arc<Buffer<f32>>,
         code: impl Fn(f32) -> usize + Sync,
-    ) -> Result<Encoded> {
+    ) -> Result<EncodedPlanes> {
         let code_bits = CODE_BITS[which];
         let word = |values: &[f32]| {
             let codes = values.iter().zip((0..).step_by(code_bits as usize));
@@ -123,7 +123,7 @@ impl Encoder {
             values.par_chunks(32 / code_bits as usize).with_min_len(WORDS_AT_ONCE).map(word);
         let words: Vec<u32> = words.collect();
         let codes = self.gpu.buffer(name, &words)?;
-        Ok(Encoded { code_bits, value_count: values.len(), codes, values: palette })
+        Ok(EncodedPlanes { code_bits, value_count: values.len(), codes, values: palette })
     }
 }
 

@@ -99,9 +99,9 @@ impl Preset {
     pub(super) fn layer(self, curve: Option<&str>, dataset: &Path) -> Result<SettingsLayer> {
         let origin = Origin::Preset(self.name());
         let mut layer = SettingsLayer::of_toml(self.toml(), &origin)?;
-        let mut say = |key: &str, value: Value| layer.push(key, value, origin.clone());
+        let mut set = |key: &str, value: Value| layer.push(key, value, origin.clone());
         if let (false, Some(curve)) = (self.is_planned(), curve) {
-            say("tone.curve", curve.into())?;
+            set("tone.curve", curve.into())?;
         }
         if !self.is_benchmark() {
             return Ok(layer);
@@ -114,28 +114,28 @@ impl Preset {
             _ => [0.0, 0.0],
         };
         match curve.parse() {
-            Ok(ToneCurve::Ase) => say("tone.gain_c", of_ase.into())?,
-            Ok(ToneCurve::Ap3) => say("tone.gain_c", of_ap3.into())?,
+            Ok(ToneCurve::Ase) => set("tone.gain_c", of_ase.into())?,
+            Ok(ToneCurve::Ap3) => set("tone.gain_c", of_ap3.into())?,
             _ => {}
         }
         if curve != Tone::Auto.name() {
-            say("tone.alpha", 0.12.into())?;
+            set("tone.alpha", 0.12.into())?;
         }
-        say("tone.theta", if is_realx3d { 0.37 } else { 0.49 }.into())?;
-        say("max_resolution", 0.into())?;
-        say("steps", if self == Self::Lom { 5_000 } else { 15_000 }.into())?;
-        say("ssim_weight", if is_realx3d { 0.2 } else { 0.0 }.into())?;
+        set("tone.theta", if is_realx3d { 0.37 } else { 0.49 }.into())?;
+        set("max_resolution", 0.into())?;
+        set("steps", if self == Self::Lom { 5_000 } else { 15_000 }.into())?;
+        set("ssim_weight", if is_realx3d { 0.2 } else { 0.0 }.into())?;
         let folder = dataset.canonicalize().unwrap_or_else(|_| dataset.to_owned());
         let scene = folder.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
         let of_scene: &[(&str, f64)] = match (self, scene.as_str()) {
             (Self::Lom, "chair") => &[("model.weights.low_ssim", 0.5)],
             (Self::Lom, "sofa") => {
-                say("schedule.means_rate_steps", 10_000.into())?;
+                set("schedule.means_rate_steps", 10_000.into())?;
                 &[("ssim_weight", 0.25)]
             }
             (Self::Lom, "shrub") => {
-                say("schedule.means_rate_steps", 20_000.into())?;
-                say("model.network.stages", 6.into())?;
+                set("schedule.means_rate_steps", 20_000.into())?;
+                set("model.network.stages", 6.into())?;
                 &[
                     ("ssim_weight", 0.4),
                     ("schedule.initial_rates.means", 2.5e-4),
@@ -146,7 +146,7 @@ impl Preset {
             _ => return Ok(layer),
         };
         tracing::info!("preset {}: the constants of scene {scene}", self.name());
-        of_scene.iter().try_for_each(|&(key, value)| say(key, value.into()))?;
+        of_scene.iter().try_for_each(|&(key, value)| set(key, value.into()))?;
         Ok(layer)
     }
 }

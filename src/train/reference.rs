@@ -23,14 +23,18 @@ pub fn reference() -> Result<String> {
     let values = values(&TrainConfig::default())?;
     let mut section = None;
     for row in SETTINGS.iter() {
-        let own = row.key.rsplit_once('.').map_or("", |(section, _)| section);
-        if section != Some(own) {
-            let title = if own.is_empty() { "The run".to_owned() } else { format!("`[{own}]`") };
+        let section_of_row = row.key.rsplit_once('.').map_or("", |(section, _)| section);
+        if section != Some(section_of_row) {
+            let title = if section_of_row.is_empty() {
+                "The run".to_owned()
+            } else {
+                format!("`[{section_of_row}]`")
+            };
             let _ = write!(
                 text,
                 "\n## {title}\n\n| key | default | takes | what it does |\n|---|---|---|---|\n"
             );
-            section = Some(own);
+            section = Some(section_of_row);
         }
         let default = values.get(row.key.as_ref()).filter(|_| row.absent.is_none());
         let _ = writeln!(

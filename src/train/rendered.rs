@@ -43,12 +43,12 @@ impl Rendered {
         for patch in patches {
             let around = patch.with_margin(margin);
             renderer.reserve_sizes(count, capacity, [around.size])?;
-            let own = renderer.render_patch(gaussians, &around, options)?;
-            planes.resize(own.len() / around.pixel_count() * whole.pixel_count(), 0.0);
-            patch.paste(&around, &own, &whole, &mut planes);
-            let channels = &own[..own.len() - around.pixel_count()];
-            let own = networks.denoised_image(channels, around.size)?;
-            patch.paste(&around, &own.data, &whole, &mut denoised.data);
+            let planes_of_part = renderer.render_patch(gaussians, &around, options)?;
+            planes.resize(planes_of_part.len() / around.pixel_count() * whole.pixel_count(), 0.0);
+            patch.paste(&around, &planes_of_part, &whole, &mut planes);
+            let channels = &planes_of_part[..planes_of_part.len() - around.pixel_count()];
+            let denoised_part = networks.denoised_image(channels, around.size)?;
+            patch.paste(&around, &denoised_part.data, &whole, &mut denoised.data);
         }
         Ok(Self { denoised: Some(denoised), ..Self::of_planes(camera, planes) })
     }

@@ -102,16 +102,17 @@ pub(super) fn value(text: &str) -> Option<Value> {
 pub(super) fn unknown(key: &str) -> Error {
     if is_section(key) {
         let keys = SETTINGS.iter().map(|row| row.key.as_ref());
-        let inner: Vec<&str> = keys.filter(|own| own.starts_with(&format!("{key}."))).collect();
+        let inner: Vec<&str> =
+            keys.filter(|inner_key| inner_key.starts_with(&format!("{key}."))).collect();
         return Error::Usage(format!("{key} is a section; set one of {}", inner.join(", ")));
     }
     let (section, name) = key.rsplit_once('.').unwrap_or(("", key));
     // A key without a section, or in an unknown one, is compared by its last name.
     let is_within = !section.is_empty() && is_section(section);
     let far = |row: &&Setting| {
-        let (own_section, own) = row.key.rsplit_once('.').unwrap_or(("", &row.key));
+        let (own_section, row_name) = row.key.rsplit_once('.').unwrap_or(("", &row.key));
         let is_elsewhere = own_section != section;
-        (is_within && is_elsewhere, distance(name, own), is_elsewhere, row.key.len())
+        (is_within && is_elsewhere, distance(name, row_name), is_elsewhere, row.key.len())
     };
     let nearest = SETTINGS.iter().min_by_key(far);
     let hint = nearest.map(|row| format!("; the nearest is `{}`", row.key)).unwrap_or_default();

@@ -12,8 +12,8 @@ use super::early_stopping::Convergence;
 use super::growth::Growth;
 use super::lamp::{self, LampLearning};
 use super::masks::Masks;
-use super::model::Model;
-use super::passes::{Kernels, first_sh_degree};
+use super::model::TrainedModel;
+use super::passes::{TrainKernels, first_sh_degree};
 use super::submission::{MAX_STEPS, Submissions};
 use super::supervision::Supervision;
 use super::target_views::TargetViews;
@@ -34,15 +34,16 @@ impl TrainConfig {
     /// dropped.
     pub(super) fn initial_model(&self, path: &Path) -> Result<Gaussians> {
         let mut gaussians = ply::load(path)?;
-        let (Shape { sh_degree, features }, own) = (self.render_settings().shape, gaussians.shape);
-        if own.sh_degree > sh_degree {
+        let (Shape { sh_degree, features }, shape) =
+            (self.render_settings().shape, gaussians.shape);
+        if shape.sh_degree > sh_degree {
             let problem = format!(
                 "has SH degree {}, more than sh_degree, which is {sh_degree}",
-                own.sh_degree
+                shape.sh_degree
             );
             return Err(Error::input(path, problem));
         }
-        let lacks = |feature| features.has(feature) && !own.features.has(feature);
+        let lacks = |feature| features.has(feature) && !shape.features.has(feature);
         if let Some(spec) = FEATURES.iter().find(|spec| lacks(spec.feature)) {
             let (property, name) = (spec.ply_name, spec.name);
             let problem = format!(
@@ -104,9 +105,13 @@ impl Trainer {
         config.frame.get_or_insert_with(|| dataset.frame());
         thread::scope(|scope| {
             // Pipelines are compiled on another thread while the views are uploaded and measured.
-            let own = config.clone();
-            let beside = scope
-                .spawn(move || Ok((Kernels::new(gpu, &own, dataset)?, Fingerprint::of(dataset)?)));
+            let config_of_thread = config.clone();
+            let beside = scope.spawn(move || {
+                Ok((
+                    TrainKernels::new(gpu, &config_of_thread, dataset)?,
+                    Fingerprint::compute(dataset)?,
+                ))
+            });
             Self::assemble(gpu, config, dataset, initial, beside)
         })
     }
@@ -116,7 +121,7 @@ impl Trainer {
         config: TrainConfig,
         dataset: &Dataset,
         initial: &Initial,
-        beside: ScopedJoinHandle<'_, Result<(Kernels, Fingerprint)>>,
+        beside: ScopedJoinHandle<'_, Result<(TrainKernels, Fingerprint)>>,
     ) -> Result<Self> {
         if let Some(CacheSize(bytes)) = config.max_vram {
             gpu.limit_memory(bytes);
@@ -163,8 +168,10 @@ impl Trainer {
         }
         dataset.views.iter().filter_map(|view| view.original.as_ref()).for_each(Original::release);
         let waits = tracing::info_span!("pipelines");
-        let (Kernels { mut renderer, mut losses, adam, finite, floor, densifier }, fingerprint) =
-            waits.in_scope(|| beside.join().unwrap_or_else(|panic| resume_unwind(panic)))?;
+        let (
+            TrainKernels { mut renderer, mut losses, adam, finite, floor, densifier },
+            fingerprint,
+        ) = waits.in_scope(|| beside.join().unwrap_or_else(|panic| resume_unwind(panic)))?;
         if lamp.is_some() {
             renderer.set_lamp(lamp)?;
         }
@@ -202,7 +209,7 @@ impl Trainer {
             law,
             step: 0,
             supervision,
-            model: Model::upload(gpu, &gaussians, degree, precision, frozen_columns)?,
+            model: TrainedModel::upload(gpu, &gaussians, degree, precision, frozen_columns)?,
             renderer,
             optimizer: Optimizer { adam, finite, floor, lamp: learning, checked: 0 },
             growth: Growth { densifier, probes, has_logged_capacity: false },
@@ -227,9 +234,9 @@ impl Trainer {
 fn given(gaussians: &Gaussians, config: &TrainConfig) -> Result<Gaussians> {
     let shape = config.render_settings().shape;
     if !shape.holds(gaussians.shape) {
-        let own = gaussians.shape;
+        let given_shape = gaussians.shape;
         return Err(Error::Usage(format!(
-            "Gaussians of shape {own:?} do not fit a model of {shape:?}"
+            "Gaussians of shape {given_shape:?} do not fit a model of {shape:?}"
         )));
     }
     Ok(gaussians.with_sh_degree(shape.sh_degree).to_frame(&config.frame.unwrap_or_default()))

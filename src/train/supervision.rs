@@ -7,7 +7,7 @@
 //! ```
 
 use super::masks::Masks;
-use super::model::Model;
+use super::model::TrainedModel;
 use super::networks::Networks;
 use super::terms::{NetworkTerms, Photographs};
 use super::views::{TrainingView, Views};
@@ -96,7 +96,7 @@ impl Supervision {
     pub(super) fn regularise(
         &mut self,
         pass: &mut Recorder<'_>,
-        model: &mut Model,
+        model: &mut TrainedModel,
         renderer: &mut Renderer,
         slot: u32,
     ) -> Result<()> {

@@ -42,7 +42,7 @@ impl TargetViews {
         for view in views {
             let Some(photograph) = targets.scene.source(view)? else { continue };
             let counted = view.counted(&photograph);
-            if counted.is_empty() || is_black(&LuminanceHistogram::of(&counted)) {
+            if counted.is_empty() || is_black(&LuminanceHistogram::new(&counted)) {
                 let name = &view.name;
                 tracing::warn!(
                     "view {name} is entirely black or masked: the model is not scored on it"
@@ -87,15 +87,15 @@ impl TargetViews {
     ) -> Result<Option<[f64; 2]>> {
         let mut sums = [0.0; 2];
         for TargetView { camera, target, mask, photograph } in &self.0 {
-            let exposure = photograph.and_then(|own| affines.get(own.0));
-            let neutral = exposure.map(|own| own.inverse().applied(target));
+            let exposure = photograph.and_then(|affine| affines.get(affine.0));
+            let neutral = exposure.map(|affine| affine.inverse().applied(target));
             let target = neutral.as_ref().unwrap_or(target);
             let rendered = render(camera)?;
             for (sum, image) in sums.iter_mut().zip([&rendered.colors, rendered.output()]) {
                 let is_aligned = photograph.is_none() && !affines.is_empty();
                 let aligned =
                     is_aligned.then(|| Affine::least_squares(image, target)).transpose()?;
-                let aligned = aligned.map(|own| own.applied(image));
+                let aligned = aligned.map(|affine| affine.applied(image));
                 let image = clamped(aligned.as_ref().unwrap_or(image));
                 *sum += psnr_of_counted(&image, target, mask.as_ref())?;
             }

@@ -235,10 +235,10 @@ impl NetworkTerms {
         }
         let held_to = match self.variant {
             NetworkVariant::Identity => {
-                let own = &mut self.photograph;
+                let photograph = &mut self.photograph;
                 let target = photographs.target;
-                crops.gather(pass, target, size, 0..COLOR_CHANNELS, padded_crop, own)?;
-                &*own
+                crops.gather(pass, target, size, 0..COLOR_CHANNELS, padded_crop, photograph)?;
+                &*photograph
             }
             NetworkVariant::Paper => colors,
         };

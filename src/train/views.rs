@@ -7,7 +7,7 @@ use std::sync::Arc;
 use glam::UVec2;
 
 use super::TrainConfig;
-use super::cache::{Cache, CacheSize, Slot};
+use super::cache::{Cache, CacheSize, CacheSlot};
 use super::epochs::Epochs;
 use super::precision::Encoder;
 use crate::Result;
@@ -34,12 +34,12 @@ pub(super) struct TrainView {
     /// The given depth, (H, W), if the dataset's map has another size.
     depth: Option<Vec<f32>>,
     /// The stored image from which its target is made in every step: planar (3, H, W), sRGB-encoded.
-    stored: Slot,
+    stored: CacheSlot,
     /// Whether that is the dark photograph, to which the curve is applied; else it is the target, tone-mapped at the
     /// photograph's own size.
     gets_curve: bool,
     /// The dark photograph, if it is not the stored image and a network uses it.
-    dark: Option<Slot>,
+    dark: Option<CacheSlot>,
 }
 
 /// An index into the dataset's views.
@@ -95,12 +95,13 @@ impl Views {
             let Some(tone_mapping) = scene.tone_mapping(view)? else { continue };
             curves.push(tone_mapping.parameters);
             let Some(image) = view.loaded()? else { continue };
-            let own = UVec2::new(image.width, image.height);
-            let sizes = (0..levels.len()).map(|level| shrunk(own, level as u32));
+            let loaded_size = UVec2::new(image.width, image.height);
+            let sizes = (0..levels.len()).map(|level| shrunk(loaded_size, level as u32));
             let sizes: Vec<UVec2> = sizes.collect();
             // At its own size, the curve is applied in every step.
-            let own = view.own_size().filter(|_| scene.settings().full_resolution);
-            let is_larger = own.filter(|own| sizes.iter().any(|size| size != own));
+            let photograph_size = view.own_size().filter(|_| scene.settings().full_resolution);
+            let is_larger = photograph_size
+                .filter(|photograph_size| sizes.iter().any(|size| size != photograph_size));
             let whole = if is_larger.is_some() { view.photograph()? } else { None };
             let whole =
                 whole.map(|whole| pseudo_gt.tone_mapped(&whole, &tone_mapping)).transpose()?;
@@ -117,7 +118,7 @@ impl Views {
                     in_dataset: DatasetView(index),
                     keeps_dark: keeps_photographs,
                     dark: resized(&image),
-                    target: whole.as_ref().filter(|_| own != Some(size)).map(resized),
+                    target: whole.as_ref().filter(|_| photograph_size != Some(size)).map(resized),
                     depth: depth.map(|depth| resized_plane(depth, &image, size)),
                 };
                 for patch in patches {
@@ -156,13 +157,13 @@ impl Views {
             let level = config.schedule.resolution_level(step);
             let view = self.get(self.of_step(config.seed, step, level));
             let slots = [Some(view.stored), view.dark].into_iter().flatten();
-            let own: u64 = slots.clone().map(|slot| self.cache.bytes(slot)).sum();
+            let bytes_of_view: u64 = slots.clone().map(|slot| self.cache.bytes(slot)).sum();
             let is_new = !taken.contains(&view.id);
-            if !taken.is_empty() && is_new && bytes + own > self.cache.budget() {
+            if !taken.is_empty() && is_new && bytes + bytes_of_view > self.cache.budget() {
                 break;
             }
             if taken.insert(view.id) {
-                bytes += own;
+                bytes += bytes_of_view;
                 wanted.extend(slots);
             }
             last = step;
@@ -268,8 +269,8 @@ impl Views {
             let mut targets = places.iter().map(target).collect::<Result<Vec<_>>>()?;
             let mut downloads = vec![];
             gpu.run("pseudo-GT", |pass| {
-                for (&place, target) in places.iter().zip(&mut targets) {
-                    pseudo_gt.map(pass, &white, &self.curves, place as u32, target)?;
+                for (&photograph_index, target) in places.iter().zip(&mut targets) {
+                    pseudo_gt.map(pass, &white, &self.curves, photograph_index as u32, target)?;
                     downloads.push(pass.download(&*target)?);
                 }
                 Ok(())

@@ -166,9 +166,9 @@ fn a_view_has_the_same_gain_in_every_block_and_in_a_run_on_all_views() {
     let whole = gains(&whole);
     let mut shared = 0;
     for block in ["coarse", "blocks/0000", "blocks/0001-2"] {
-        let own = gains(&city.path("city").join(block).join("run"));
-        assert_eq!(own["model_gain"], whole["model_gain"], "{block}");
-        for (view, gain) in own["gains"].as_object().unwrap() {
+        let of_block = gains(&city.path("city").join(block).join("run"));
+        assert_eq!(of_block["model_gain"], whole["model_gain"], "{block}");
+        for (view, gain) in of_block["gains"].as_object().unwrap() {
             assert_eq!(*gain, whole["gains"][view], "{block} {view}");
             shared += 1;
         }
@@ -246,8 +246,8 @@ fn a_full_disk_stops_a_join_with_one_line_and_leaves_no_manifest_until_there_is_
                 fs::create_dir_all(model.join("0")).unwrap();
             }
             let partial = fill_the_disk_for(&folder.join(file));
-            let place = folder.join(file).display().to_string();
-            refused(&join, 1, &[&place, "cannot be written", "check the folder and the disk"]);
+            let blocked = folder.join(file).display().to_string();
+            refused(&join, 1, &[&blocked, "cannot be written", "check the folder and the disk"]);
             assert!(!model.join("manifest.json").exists(), "{file}: half a model with a manifest");
             assert!(partial.symlink_metadata().is_err(), "{file}: half a file");
             // No command takes it for a model.

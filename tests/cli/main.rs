@@ -175,7 +175,8 @@ fn eval_agrees_with_train_and_saves_the_scored_images() {
     for name in ["000", "008"] {
         let load =
             |kind: &str| Image::load(run.join("eval").join(kind).join(name).with_extension("png"));
-        let scores = Scores::of(&load("renders").unwrap(), &load("references").unwrap()).unwrap();
+        let scores =
+            Scores::measure(&load("renders").unwrap(), &load("references").unwrap()).unwrap();
         let scored = &trained["views"][name];
         assert!((scores.psnr - scored["psnr"].as_f64().unwrap()).abs() < 0.01, "{name}");
         assert!((scores.ssim - scored["ssim"].as_f64().unwrap()).abs() < 0.001, "{name}");

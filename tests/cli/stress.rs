@@ -187,7 +187,7 @@ impl Case {
         let worst = report.kernels().into_iter().max_by(|a, b| a.2.total_cmp(&b.2));
         row.error = worst.map(|(kernel, _, error)| (kernel, error));
         row.render_error = render_error(&mut trainer, &config, &camera, &after)?;
-        let own = |gaussians: &Gaussians| of_gaussians(gaussians, &concerned);
+        let of_concerned = |gaussians: &Gaussians| of_gaussians(gaussians, &concerned);
         row.problem = if let Some(difference) = report.first_difference() {
             Some(difference.to_string())
         } else if !row.loss.is_some_and(f64::is_finite) {
@@ -201,11 +201,13 @@ impl Case {
             Some(format!("the render is off by {:?}", row.render_error))
         } else {
             match self.expect {
-                Expect::NoTrace if largest(&own(&gradients)) > 0.0 => {
+                Expect::NoTrace if largest(&of_concerned(&gradients)) > 0.0 => {
                     Some("it leaves a gradient".to_owned())
                 }
-                Expect::NoTrace if own(&before) != own(&after) => Some("it moves".to_owned()),
-                Expect::Learns if largest(&own(&gradients)) == 0.0 => {
+                Expect::NoTrace if of_concerned(&before) != of_concerned(&after) => {
+                    Some("it moves".to_owned())
+                }
+                Expect::Learns if largest(&of_concerned(&gradients)) == 0.0 => {
                     Some("it has no gradient".to_owned())
                 }
                 _ => None,
@@ -221,11 +223,11 @@ const MAX_RENDER_ERROR: f64 = 2.0 / 255.0;
 /// Every parameter of some Gaussians.
 fn of_gaussians(gaussians: &Gaussians, wanted: &Range<usize>) -> Vec<f32> {
     let planes = ATTRIBUTES.iter().map(|spec| gaussians.plane(spec.attribute));
-    let own = planes.flat_map(|plane| {
+    let selected = planes.flat_map(|plane| {
         let width = plane.len() / gaussians.count.max(1);
         &gaussians.parameters[plane.start + wanted.start * width..][..wanted.len() * width]
     });
-    own.copied().collect()
+    selected.copied().collect()
 }
 
 /// The largest difference between the trainer's render and that of the references in f64, without tiles; `None` if that
@@ -243,7 +245,8 @@ fn render_error(
     let render = trainer.render(camera)?.colors;
     let settings = config.render_settings();
     let sh_degree = config.schedule.sh_degree(config.steps, config.sh_degree);
-    let camera = reference::camera::Camera::from(&kernels::Camera::from(&Patch::from(camera)));
+    let camera =
+        reference::camera::ReferenceCamera::from(&kernels::Camera::from(&Patch::from(camera)));
     let Gaussians { count, shape, .. } = *gaussians;
     let planes =
         Planes { count, feature_count: 0, sh_degree: shape.sh_degree, rest_by_column: false };
@@ -251,8 +254,9 @@ fn render_error(
     let project = |i| {
         let gaussian = planes.load(&gaussians.parameters, i);
         let RenderSettings { raw_colors, antialiased, .. } = settings;
-        let own = ProjectionSettings { near, sh_degree, raw_colors, antialiased, lamp: None };
-        project_gaussian(&camera, own, &gaussian)
+        let projection =
+            ProjectionSettings { near, sh_degree, raw_colors, antialiased, lamp: None };
+        project_gaussian(&camera, projection, &gaussian)
     };
     let mut seen: Vec<_> = (0..count).filter_map(project).collect();
     seen.sort_by(|a, b| a.depth.total_cmp(&b.depth));

@@ -28,10 +28,10 @@ struct Sweep {
 
 impl Sweep {
     fn new(options: &str) -> Self {
-        Self::of(set(), &format!("--sh-degree 0 {options}"))
+        Self::with_dataset(set(), &format!("--sh-degree 0 {options}"))
     }
 
-    fn of(set: &Path, options: &str) -> Self {
+    fn with_dataset(set: &Path, options: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let (set, out) = (set.display(), folder.path().display());
         Self { arguments: format!("sweep {set} --out {out} {options}"), folder }
@@ -290,7 +290,7 @@ fn misuse_is_refused_before_anything_is_trained() {
         list["frames"] = Value::Array(vec![]);
         fs::write(path, list.to_string()).unwrap();
     }
-    let sweep = Sweep::of(one.path(), "--steps 2 --curves ap3");
+    let sweep = Sweep::with_dataset(one.path(), "--steps 2 --curves ap3");
     let (_, message) = run(&sweep.arguments, 3);
     let line = message.lines().last().unwrap();
     assert!(line.contains(one.path().to_str().unwrap()), "{line}");
@@ -301,8 +301,10 @@ fn misuse_is_refused_before_anything_is_trained() {
 /// The same trainings as `train --preset`, with every figure on every page.
 #[test]
 fn presets_are_trained_by_their_plans_scored_during_training_and_compared() {
-    let sweep =
-        Sweep::of(set(), "--table presets --presets draft,paper,balanced --steps 6 --eval-every 2");
+    let sweep = Sweep::with_dataset(
+        set(),
+        "--table presets --presets draft,paper,balanced --steps 6 --eval-every 2",
+    );
     let points = ["preset=draft", "preset=paper", "preset=balanced"];
     assert_eq!(sweep.names(), points);
     let (shown, _) = run(&sweep.arguments, 0);
@@ -362,7 +364,7 @@ fn without_references_test_views_are_scored_against_their_own_targets() {
     assert!(status.success());
     let root = copy.path().join(set().file_name().unwrap());
     fs::remove_dir_all(root.join("high")).unwrap();
-    let sweep = Sweep::of(&root, "--presets draft --steps 2 --json");
+    let sweep = Sweep::with_dataset(&root, "--presets draft --steps 2 --json");
     let (json, _) = run(&sweep.arguments, 0);
     let json: Value = serde_json::from_str(&json).unwrap();
     let point = &json["points"][0];

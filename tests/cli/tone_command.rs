@@ -49,7 +49,7 @@ fn a_folder_is_mapped_by_name_and_unreadable_files_are_left_out() {
         let settings = ToneSettings { gain_c: 2.0, theta: 0.4, ..ToneSettings::new(curve) };
         for (name, file) in [("a", "a.PNG"), ("b", "b.png"), ("c", "c.exr")] {
             let image = Image::load(photographs.join(file)).unwrap();
-            let statistics = Statistics::of(&image.data);
+            let statistics = Statistics::new(&image.data);
             let before = views[name].before;
             assert_eq!([before.p10, before.p90], statistics.percentiles());
             let paper = ToneSettings::new(ToneCurve::Ap3).offset(statistics.printed_ratio());
@@ -77,7 +77,7 @@ fn exr_is_not_rounded_and_clipping_is_counted() {
     let linear = args(&photograph, &out, "--curve linear --format exr");
     let views = apply(&linear).unwrap().views;
     let settings = ToneSettings::new(ToneCurve::Linear);
-    let parameters = settings.parameters(&Statistics::of(&image.data));
+    let parameters = settings.parameters(&Statistics::new(&image.data));
     let expected: Vec<f32> =
         image.data.iter().map(|&x| settings.curve.apply(x, &parameters)).collect();
     let mapped = Image::load(dir.path().join("out/one.exr")).unwrap();
@@ -186,11 +186,11 @@ fn scene_statistics_give_every_photograph_one_curve() {
         let args = args(&low, &out, &format!("--format exr {options}"));
         let output = apply(&args).unwrap();
         let statistics = ["a", "b", "c"].map(|name| {
-            Statistics::of(&Image::load(low.join(name).with_extension("png")).unwrap().data)
+            Statistics::new(&Image::load(low.join(name).with_extension("png")).unwrap().data)
         });
         let scene = Statistics::mean_of(&statistics).unwrap();
-        for (name, own) in ["a", "b", "c"].into_iter().zip(&statistics) {
-            let used = if scene_statistics { &scene } else { own };
+        for (name, of_photograph) in ["a", "b", "c"].into_iter().zip(&statistics) {
+            let used = if scene_statistics { &scene } else { of_photograph };
             let parameters = output.curve.parameters(used);
             let photograph = Image::load(low.join(name).with_extension("png")).unwrap();
             let mapped = Image::load(out.join(name).with_extension("exr")).unwrap();

@@ -11,13 +11,16 @@ use nightsplat::splats::render::RenderSettings;
 use serde_json::{Value, json};
 
 /// A folder with a dataset of dark photographs, whose runs read the fastest tiles from a file next to it.
-struct Place(tempfile::TempDir);
+struct Workspace(tempfile::TempDir);
 
-impl Place {
+impl Workspace {
     fn new() -> Self {
-        let place = Self(tempfile::tempdir().unwrap());
-        succeed(&format!("synth {} --views 3 --width 32 --height 24", place.path("set").display()));
-        place
+        let workspace = Self(tempfile::tempdir().unwrap());
+        succeed(&format!(
+            "synth {} --views 3 --width 32 --height 24",
+            workspace.path("set").display()
+        ));
+        workspace
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -70,80 +73,81 @@ fn unusual() -> Tile {
 
 #[test]
 fn tuning_times_every_supported_tile_and_saves_the_fastest() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let arguments = "bench --tune --json --width 64 --height 48 --gaussians 300 --repeats 1";
-    let printed: Value = serde_json::from_str(&place.run(arguments).0).unwrap();
+    let printed: Value = serde_json::from_str(&workspace.run(arguments).0).unwrap();
     let cases = printed["cases"].as_array().unwrap();
     assert_eq!(cases.iter().map(|case| &case["channels"]).collect::<Vec<_>>(), [3, 11]);
     for tile in cases.iter().flat_map(|case| case["tiles"].as_array().unwrap()) {
-        let own: Tile = serde_json::from_value(tile["tile"].clone()).unwrap();
-        assert!(gpu().properties().suits_tile(own), "{tile}");
+        let timed: Tile = serde_json::from_value(tile["tile"].clone()).unwrap();
+        assert!(gpu().properties().suits_tile(timed), "{tile}");
         assert_eq!(tile["agrees"], true, "{tile}");
         assert!(tile["rasteriser_ms"].as_f64().unwrap() > 0.0, "{tile}");
     }
-    let kept: Value = serde_json::from_slice(&fs::read(place.path("tiles.json")).unwrap()).unwrap();
+    let kept: Value =
+        serde_json::from_slice(&fs::read(workspace.path("tiles.json")).unwrap()).unwrap();
     assert_eq!(kept["tiles"], printed["tiles"]);
     assert_eq!(kept["driver"], gpu().properties().driver.as_str());
     let chosen: Tile = serde_json::from_value(kept["tiles"][0]["tile"].clone()).unwrap();
-    assert_eq!(place.train("run", "--steps 1").1, chosen);
+    assert_eq!(workspace.train("run", "--steps 1").1, chosen);
 }
 
 #[test]
 fn the_saved_tile_is_used_unless_another_is_set_and_a_resumed_run_keeps_its_own() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     assert_ne!(unusual(), built_in());
-    assert_eq!(place.train("none", "--steps 1").1, built_in());
-    place.write(&tuning(unusual()));
-    assert_eq!(place.train("kept", "--steps 2 --checkpoint-every 2").1, unusual());
+    assert_eq!(workspace.train("none", "--steps 1").1, built_in());
+    workspace.write(&tuning(unusual()));
+    assert_eq!(workspace.train("kept", "--steps 2 --checkpoint-every 2").1, unusual());
     let [width, height] = built_in().size;
     let asked = format!("--steps 1 --set tile=[{width},{height}]");
-    assert_eq!(place.train("asked", &asked).1, built_in());
-    place.write(&tuning(built_in()));
-    assert_eq!(place.train("kept", "--steps 3 --resume --checkpoint-every 2").1, unusual());
-    place.run(&format!("eval {}", place.path("kept").display()));
+    assert_eq!(workspace.train("asked", &asked).1, built_in());
+    workspace.write(&tuning(built_in()));
+    assert_eq!(workspace.train("kept", "--steps 3 --resume --checkpoint-every 2").1, unusual());
+    workspace.run(&format!("eval {}", workspace.path("kept").display()));
     // In the other tests, the command's file is disabled.
-    let (set, out) = (place.path("set"), place.path("off"));
-    place.write(&tuning(unusual()));
+    let (set, out) = (workspace.path("set"), workspace.path("off"));
+    workspace.write(&tuning(unusual()));
     succeed(&format!("train {} --out {} --steps 1", set.display(), out.display()));
-    assert_eq!(place.recorded("off"), built_in());
+    assert_eq!(workspace.recorded("off"), built_in());
 }
 
 #[test]
 fn the_tile_is_recorded_so_that_the_same_file_gives_the_same_bits() {
-    let place = Place::new();
-    place.write(&tuning(unusual()));
-    place.train("first", "--steps 20");
-    place.write(&tuning(built_in()));
-    let config = place.path("first").join("config.toml");
-    place.train("again", &format!("--steps 20 --config {}", config.display()));
-    let model = |run: &str| fs::read(place.path(run).join("model.ply")).unwrap();
+    let workspace = Workspace::new();
+    workspace.write(&tuning(unusual()));
+    workspace.train("first", "--steps 20");
+    workspace.write(&tuning(built_in()));
+    let config = workspace.path("first").join("config.toml");
+    workspace.train("again", &format!("--steps 20 --config {}", config.display()));
+    let model = |run: &str| fs::read(workspace.path(run).join("model.ply")).unwrap();
     assert_eq!(model("first"), model("again"));
 }
 
 #[test]
 fn a_damaged_file_and_one_of_another_driver_are_ignored_with_one_line() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let mut other = tuning(unusual());
     other["driver"] = json!("of another year");
-    place.write(&other);
+    workspace.write(&other);
     let message = |run: &str, part: &str| {
-        let (stderr, tile) = place.train(run, "--steps 1");
+        let (stderr, tile) = workspace.train(run, "--steps 1");
         assert_eq!(tile, built_in(), "{stderr}");
         let lines: Vec<&str> = stderr.lines().filter(|line| line.contains("tiles.json")).collect();
         assert!(lines.len() == 1 && lines[0].contains(part), "{stderr}");
         assert!(lines[0].contains("bench --tune"), "{stderr}");
     };
     message("driver", "of another year");
-    fs::write(place.path("tiles.json"), "{\"device\": ").unwrap();
+    fs::write(workspace.path("tiles.json"), "{\"device\": ").unwrap();
     message("damaged", "is damaged");
-    place.write(&tuning([3, 3].into()));
+    workspace.write(&tuning([3, 3].into()));
     message("unsuitable", "3x3 tiles do not suit");
 }
 
 #[test]
 fn an_unsupported_tile_is_refused_with_the_remedy() {
-    let place = Place::new();
-    let (set, out) = (place.path("set"), place.path("run"));
+    let workspace = Workspace::new();
+    let (set, out) = (workspace.path("set"), workspace.path("run"));
     for tile in ["[3,3]", "[0,8]", "[4096,4096]", "[4294967295,4294967295]", "[16,16,3]"] {
         let arguments =
             format!("train {} --out {} --set tile={tile}", set.display(), out.display());

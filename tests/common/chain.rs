@@ -4,8 +4,8 @@ use glam::{DVec2, DVec3};
 use nightsplat::kernels::splat::RECORD_HEAD;
 use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
-use nightsplat::reference::camera::Camera;
-use nightsplat::reference::lamp::{self, Lamp};
+use nightsplat::reference::camera::ReferenceCamera;
+use nightsplat::reference::lamp::{self, ReferenceLamp};
 use nightsplat::reference::project::{Projection, ProjectionSettings, project_gaussian};
 use nightsplat::reference::project_backward::{
     DSplat, Lit, project_gaussian_backward, splat_gradient,
@@ -21,7 +21,7 @@ pub(crate) struct Chain<'a> {
     setup: &'a Setup,
     pub(crate) d_render: Vec<f64>,
     /// The lamp of the settings.
-    pub(crate) lamp: Option<Lamp>,
+    pub(crate) lamp: Option<ReferenceLamp>,
 }
 
 /// The splats of a render, front to back, with the indices of their Gaussians.
@@ -55,7 +55,7 @@ impl<'a> Chain<'a> {
         let count = setup.channels() * setup.pixels();
         // Values of f32, as on the device.
         let d_render = (0..count).map(|_| f64::from(random.between(-1.0, 1.0) as f32)).collect();
-        let lamp = setup.settings.lamp.map(|lamp| Lamp::of(&lamp.numbers()));
+        let lamp = setup.settings.lamp.map(|lamp| ReferenceLamp::from_numbers(&lamp.numbers()));
         Self { setup, d_render, lamp }
     }
 
@@ -67,15 +67,16 @@ impl<'a> Chain<'a> {
         self.setup.background().into_iter().map(f64::from).collect()
     }
 
-    fn project(&self, camera: &Camera, parameters: &[f64]) -> Projected {
+    fn project(&self, camera: &ReferenceCamera, parameters: &[f64]) -> Projected {
         let Setup { settings, options, .. } = self.setup;
         let one = |i| -> Option<(usize, Projection, Vec<f64>)> {
             let gaussian = self.setup.planes().load(parameters, i);
             let RenderSettings { near, raw_colors, antialiased, .. } = *settings;
             let (near, sh_degree) = (near.into(), options.sh_degree);
             let lamp = self.lamp;
-            let own = ProjectionSettings { near, sh_degree, raw_colors, antialiased, lamp };
-            let projection = project_gaussian(camera, own, &gaussian)?;
+            let projection_settings =
+                ProjectionSettings { near, sh_degree, raw_colors, antialiased, lamp };
+            let projection = project_gaussian(camera, projection_settings, &gaussian)?;
             Some((i, projection, gaussian.features))
         };
         let mut visible: Vec<_> = (0..self.setup.count).filter_map(one).collect();
@@ -146,15 +147,22 @@ impl<'a> Chain<'a> {
         let planes = self.setup.planes();
         let Setup { settings, options, .. } = self.setup;
         for (j, &i) in ids.iter().enumerate() {
-            let (own, color) = (&gradient_records[record * j..][..record], &colors[channels * j..]);
-            let d_splat = self.d_splat(&splats[j], own, color);
+            let (record_gradient, color) =
+                (&gradient_records[record * j..][..record], &colors[channels * j..]);
+            let d_splat = self.d_splat(&splats[j], record_gradient, color);
             let gaussian = planes.load(parameters, i);
             let (degree, antialiased) = (options.sh_degree, settings.antialiased);
             let splat = &splats[j];
             let lit = self.lamp.map(|lamp| Lit { lamp, color: DVec3::from_slice(color) });
-            let own = (splat, lit);
-            let d =
-                project_gaussian_backward(&camera, degree, antialiased, &gaussian, own, &d_splat);
+            let splat_and_lit = (splat, lit);
+            let d = project_gaussian_backward(
+                &camera,
+                degree,
+                antialiased,
+                &gaussian,
+                splat_and_lit,
+                &d_splat,
+            );
             if let Some(Lit { lamp, color }) = lit {
                 let point = camera.view(gaussian.mean);
                 let share = lamp.gradient(point);

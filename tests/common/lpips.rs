@@ -45,10 +45,10 @@ fn tensors(network: Network) -> Vec<(String, Vec<usize>)> {
         Network::Alex => (ALEXNET, [64, 192, 384, 256, 256]),
         Network::Vgg => (VGG16, [64, 128, 256, 512, 512]),
     };
-    let convolutions = layers.iter().flat_map(|&(place, outputs, inputs, window)| {
+    let convolutions = layers.iter().flat_map(|&(layer, outputs, inputs, window)| {
         [
-            (format!("net.{place}.weight"), vec![outputs, inputs, window, window]),
-            (format!("net.{place}.bias"), vec![outputs]),
+            (format!("net.{layer}.weight"), vec![outputs, inputs, window, window]),
+            (format!("net.{layer}.bias"), vec![outputs]),
         ]
     });
     let linear =

@@ -7,11 +7,11 @@ pub(crate) mod chain;
 pub(crate) mod command;
 pub(crate) mod log;
 pub(crate) mod lpips;
-pub(crate) mod place;
 pub(crate) mod png;
 pub(crate) mod safetensors;
 pub(crate) mod setup;
 pub(crate) mod train;
+pub(crate) mod workspace;
 
 use std::path::{Path, PathBuf};
 

@@ -8,7 +8,7 @@ use nightsplat::kernels::camera_pinhole::JACOBIAN_MARGIN;
 use nightsplat::photographs::tone::Profile;
 use nightsplat::reference::camera::fisheye::Fisheye;
 use nightsplat::reference::camera::pinhole::Pinhole;
-use nightsplat::reference::camera::{Camera, Model};
+use nightsplat::reference::camera::{ReferenceCamera, ReferenceLens};
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
 use nightsplat::splats::batches::Batches;
@@ -123,23 +123,23 @@ impl Setup {
     }
 
     /// The camera as the references use it.
-    pub(crate) fn camera(&self) -> Camera {
+    pub(crate) fn camera(&self) -> ReferenceCamera {
         let camera::Camera { width, height, focal, principal_point, model, view_from_world } =
             self.camera;
         let size = UVec2::new(width, height).as_dvec2();
         let DAffine3 { matrix3: rotation, translation } = view_from_world;
         let margin = JACOBIAN_MARGIN * size;
         let model = match model {
-            CameraModel::Pinhole => Model::Pinhole(Pinhole {
+            CameraModel::Pinhole => ReferenceLens::Pinhole(Pinhole {
                 min_slope: -(principal_point + margin) / focal,
                 max_slope: (size - principal_point + margin) / focal,
             }),
-            CameraModel::Fisheye(lens) => Model::Fisheye(Fisheye {
+            CameraModel::Fisheye(lens) => ReferenceLens::Fisheye(Fisheye {
                 distortion: lens.coefficients,
                 largest_angle: lens.largest_angle(),
             }),
         };
-        Camera { rotation, translation, focal, principal_point, size, model }
+        ReferenceCamera { rotation, translation, focal, principal_point, size, model }
     }
 
     pub(crate) fn get(&self, i: usize) -> Gaussian {

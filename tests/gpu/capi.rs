@@ -147,11 +147,11 @@ fn lend(host: &Host, flags: u32) -> NspHostDevice {
 }
 
 fn image(picture: &Picture) -> NspImage {
-    let state = |own: ImageState| NspImageState {
-        layout: vk::ImageLayout::from_raw(own.layout),
+    let state = |given: ImageState| NspImageState {
+        layout: vk::ImageLayout::from_raw(given.layout),
         family: vk::QUEUE_FAMILY_IGNORED,
-        stages: vk::PipelineStageFlags2::from_raw(own.stages),
-        access: vk::AccessFlags2::from_raw(own.access),
+        stages: vk::PipelineStageFlags2::from_raw(given.stages),
+        access: vk::AccessFlags2::from_raw(given.access),
     };
     NspImage {
         image: picture.image,
@@ -334,19 +334,19 @@ fn a_record_only_host_gets_our_own_render_without_a_submission_or_a_wait() {
 #[test]
 fn a_model_of_arrays_is_that_of_the_file_and_joined_models_are_sorted_together() {
     let mut session = Session::new(|_| {});
-    let (own, device) = (gaussians(2), session.device);
+    let (arrays, device) = (gaussians(2), session.device);
     let planes: [*const f32; 6] = [
-        own.means().as_ptr().cast(),
-        own.quats().as_ptr().cast(),
-        own.log_scales().as_ptr().cast(),
-        own.raw_opacities().as_ptr(),
-        own.dc().as_ptr().cast(),
-        own.rest().as_ptr().cast(),
+        arrays.means().as_ptr().cast(),
+        arrays.quats().as_ptr().cast(),
+        arrays.log_scales().as_ptr().cast(),
+        arrays.raw_opacities().as_ptr(),
+        arrays.dc().as_ptr().cast(),
+        arrays.rest().as_ptr().cast(),
     ];
     // SAFETY: six arrays of the right lengths.
     ok(unsafe { nsp_model_create(device, 400, 2, planes.as_ptr(), &mut session.model) });
     ok(session.create());
-    session.assert_draws(1, &Model::from(own.clone()));
+    session.assert_draws(1, &Model::from(arrays.clone()));
 
     // Turned and moved, and turned and moved back.
     let pose = DAffine3::from_rotation_translation(
@@ -370,7 +370,7 @@ fn a_model_of_arrays_is_that_of_the_file_and_joined_models_are_sorted_together()
         nsp_model_destroy(there);
         nsp_model_destroy(std::mem::replace(&mut session.model, back));
     }
-    session.assert_draws(2, &Model::from(own.clone()));
+    session.assert_draws(2, &Model::from(arrays.clone()));
 
     // Two copies, one farther away.
     let mut both = null_mut();
@@ -396,12 +396,12 @@ fn a_model_of_arrays_is_that_of_the_file_and_joined_models_are_sorted_together()
 fn a_model_that_states_its_law_is_drawn_as_its_dark_photographs_or_in_their_linear_light() {
     let mut session = Session::new(|_| {});
     let law = law();
-    let own = Model { law: Some(law), ..gaussians(2).into() };
-    own.save(session.folder.path().join("model.ply")).unwrap();
+    let model = Model { law: Some(law), ..gaussians(2).into() };
+    model.save(session.folder.path().join("model.ply")).unwrap();
     session.prepare();
     assert_eq!(session.info().law_stops, law.stops());
     let inverse = InverseTone::of_law(&law);
-    let planes = own_planes(&own);
+    let planes = own_planes(&model);
     let drawn = |number, exposure, format: ImageFormat| {
         let picture = session.host.picture(format, SIZE).unwrap();
         let (camera, commands) = (c_camera(), session.host.begin());
@@ -425,7 +425,7 @@ fn a_model_that_states_its_law_is_drawn_as_its_dark_photographs_or_in_their_line
         let target = [0, 1, 2].map(|c| f64::from(planes[c * PIXELS + at]) / alpha.max(1e-9));
         let bytes = dark[at].to_le_bytes();
         let halves = [linear[2 * at], linear[2 * at] >> 16, linear[2 * at + 1]];
-        for (c, x) in inverse.of(target).rgb.into_iter().enumerate() {
+        for (c, x) in inverse.invert(target).rgb.into_iter().enumerate() {
             let byte = (255.0 * (x * alpha).clamp(0.0, 1.0)).round();
             assert!((f64::from(bytes[c]) - byte).abs() <= 1.0, "{at}: {bytes:?} {byte}");
             let light =
@@ -474,11 +474,11 @@ fn an_engines_matrices_give_the_camera_whatever_its_axes() {
                 &mut camera,
             )
         });
-        let own = Camera::from(&camera);
+        let converted = Camera::from(&camera);
         let focal = f64::from(height) / 2.0 / f64::from(vertical / 2.0).tan();
-        assert!((own.focal - focal).abs().max_element() < 1e-2, "{own:?}");
-        assert!((own.principal_point - glam::DVec2::new(320.0, 240.0)).length() < 1e-3);
-        assert!(own.view_from_world.abs_diff_eq(pose, 1e-6), "{own:?}");
+        assert!((converted.focal - focal).abs().max_element() < 1e-2, "{converted:?}");
+        assert!((converted.principal_point - glam::DVec2::new(320.0, 240.0)).length() < 1e-3);
+        assert!(converted.view_from_world.abs_diff_eq(pose, 1e-6), "{converted:?}");
     }
     let refuse = |view: &Mat4, projection: &Mat4, word: &str| {
         // SAFETY: as above.

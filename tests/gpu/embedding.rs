@@ -24,24 +24,28 @@ fn a_borrowed_device_renders_the_same_and_is_returned_unchanged() {
 }
 
 fn lend_and_take_back(extensions: &[&CStr]) {
-    let own = render(&gpu());
-    assert!(own.data.iter().any(|&value| value > 0.5), "nothing is seen");
+    let expected = render(&gpu());
+    assert!(expected.data.iter().any(|&value| value > 0.5), "nothing is seen");
 
     let host = Host::new(extensions);
-    let mut memory = host.memory(own.data.len());
+    let mut memory = host.memory(expected.data.len());
     host.fill(&memory, 0xcafe_f00d);
 
     // SAFETY: the handles are the host's own and outlive `lent`; nothing else uses the queue meanwhile.
     let lent = unsafe { Gpu::from_host(host.lend()) }.unwrap();
-    assert_same("our own submissions", &render(&lent), &own);
-    assert_eq!(memory.read(), vec![0xcafe_f00d; own.data.len()], "the host's memory changed");
+    assert_same("our own submissions", &render(&lent), &expected);
+    assert_eq!(memory.read(), vec![0xcafe_f00d; expected.data.len()], "the host's memory changed");
     render_into(&host, &lent, &mut memory);
     let data = memory.read().into_iter().map(f32::from_bits).collect();
-    assert_same("recorded into the host's command buffer", &Image { data, ..own.clone() }, &own);
+    assert_same(
+        "recorded into the host's command buffer",
+        &Image { data, ..expected.clone() },
+        &expected,
+    );
     drop(lent);
 
     host.fill(&memory, 0x1234_5678);
-    assert_eq!(memory.read(), vec![0x1234_5678; own.data.len()], "the device is not alive");
+    assert_eq!(memory.read(), vec![0x1234_5678; expected.data.len()], "the device is not alive");
     host.free(memory);
     // Objects that the library did not destroy would be reported when the host destroys its device.
     host.destroy();

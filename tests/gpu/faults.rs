@@ -182,15 +182,18 @@ fn memory_is_estimated_to_a_fifth() {
         config.schedule.sh_degree_interval = sh_degree_interval;
         config.model.denoiser = stages > 0;
         config.model.network.stages = stages.max(1);
-        let (own, trained) = foreseen(&gpu, &config);
+        let (estimate, trained) = foreseen(&gpu, &config);
         assert_eq!(trained.trainer.gaussian_count(), 9000);
-        assert_eq!(own.peak_gaussians, 9000);
+        assert_eq!(estimate.peak_gaussians, 9000);
         let spent = &trained.spent;
-        let share = own.peak_device as f64 / spent.device_bytes as f64;
-        assert!((0.8..=1.2).contains(&share), "{own:?}, and {spent:?} came");
+        let share = estimate.peak_device as f64 / spent.device_bytes as f64;
+        assert!((0.8..=1.2).contains(&share), "{estimate:?}, and {spent:?} came");
         if let Some(host) = spent.host_bytes {
             // Other tests of this process have raised the peak; the estimate is at least the present memory.
-            assert!(own.peak_host as f64 <= 1.2 * host as f64, "{own:?}, and {spent:?} came");
+            assert!(
+                estimate.peak_host as f64 <= 1.2 * host as f64,
+                "{estimate:?}, and {spent:?} came"
+            );
         }
     }
 }

@@ -275,7 +275,7 @@ fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
     // Tiles of one subgroup without splats, since a workgroup then costs almost nothing.
     const COLUMNS: u32 = 9;
     const ROWS: u32 = 5;
-    let gpu = gpu_with(|own| own.max_workgroups = 7);
+    let gpu = gpu_with(|properties| properties.max_workgroups = 7);
     let lanes = gpu.properties().subgroup_size;
     let size = UVec2::new(lanes * COLUMNS, ROWS);
     let constants = blend_forward::Constants {

@@ -216,8 +216,8 @@ fn every_colour_format_gets_our_own_render_to_a_level_in_each_layer_over_what_it
             draw(&mut shown, frame, &Target { color, is_over, exposure: 1.5, ..Target::default() });
             let layers = host.read_picture(&picture, words(format));
             for ((camera, pixels), under) in cameras().iter().zip(&layers).zip(&under) {
-                let own = expected(camera, encoding, swaps, is_over.then_some(under));
-                let off = levels(pixels, &own, encoding == pixels::PIXELS_LINEAR_HALF);
+                let picture = expected(camera, encoding, swaps, is_over.then_some(under));
+                let off = levels(pixels, &picture, encoding == pixels::PIXELS_LINEAR_HALF);
                 assert!(off <= 1, "{format:?}: {off} levels");
             }
             assert_ne!(layers[0], layers[1], "both layers show one view");
@@ -332,7 +332,7 @@ fn the_hosts_depth_hides_what_is_beyond_it_in_every_format_and_convention() {
                     let is_hidden = at as u32 % SIZE[0] < SIZE[0] / 2;
                     assert_eq!(seen, if is_hidden { 0.0 } else { *untested }, "{format:?} {at}");
                 }
-                [beyond, before, half].into_iter().for_each(|own| host.free_picture(own));
+                [beyond, before, half].into_iter().for_each(|picture| host.free_picture(picture));
             }
         }
     });
@@ -385,7 +385,7 @@ fn a_draw_with_depths_agrees_with_the_references_and_with_a_composite() {
                 }
             }
             assert!(seen > 20, "{seen} pixels are covered");
-            [color, depth].into_iter().for_each(|own| host.free_picture(own));
+            [color, depth].into_iter().for_each(|picture| host.free_picture(picture));
         }
         host.free_picture(wall);
     }

@@ -56,9 +56,9 @@ fn each_defect_is_found_and_named() {
 /// As layers over another API do: they name one size, and the GPU runs another.
 #[test]
 fn a_device_whose_subgroups_are_smaller_than_it_reports_is_refused_with_the_size_to_set() {
-    let gpu = gpu_with(|own| {
-        own.subgroup_size *= 2;
-        own.subgroup_size_is_selectable = false;
+    let gpu = gpu_with(|properties| {
+        properties.subgroup_size *= 2;
+        properties.subgroup_size_is_selectable = false;
     });
     let lanes = gpu.properties().subgroup_size;
     let message = refusal(&gpu);

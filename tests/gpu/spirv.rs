@@ -135,7 +135,7 @@ fn shared_memory(module: &[u32]) -> u32 {
 
 /// The number in a requirement such as `maxComputeSharedMemorySize >= 16384`.
 fn required(limit: &str) -> u32 {
-    let requirement = REQUIREMENTS.iter().find(|own| own.name.starts_with(limit)).unwrap();
+    let requirement = REQUIREMENTS.iter().find(|known| known.name.starts_with(limit)).unwrap();
     requirement.name.split(' ').next_back().unwrap().parse().unwrap()
 }
 

@@ -94,9 +94,10 @@ fn a_module_uses_only_modules_above_it() {
     let mut broken = vec![];
     for (path, text) in files("src", "rs") {
         // `main` is above all modules, and `lib` only lists them.
-        let Some(own) = layer(module(&path)) else { continue };
+        let Some(layer_of_file) = layer(module(&path)) else { continue };
         for used in circles::paths(&text).iter().filter(|used| used[0] == "crate") {
-            let used = used.get(1).filter(|used| layer(used).is_some_and(|used| used > own));
+            let used =
+                used.get(1).filter(|used| layer(used).is_some_and(|used| used > layer_of_file));
             broken.extend(used.map(|used| format!("{} uses {used}", path.display())));
         }
     }
@@ -178,10 +179,10 @@ fn unsafe_code_is_only_in_the_gpu_layer_and_the_c_interface() {
 #[test]
 fn tests_start_the_command_and_look_for_captures_in_one_place() {
     // There, validation fails the command, and missing captures are reported.
-    for (what, place) in [("CARGO_BIN_", "common/command.rs"), ("/../shar", "common/mod.rs")] {
+    for (what, file) in [("CARGO_BIN_", "common/command.rs"), ("/../shar", "common/mod.rs")] {
         for (path, text) in files("tests", "rs") {
-            let allowed = path.ends_with(place) || path.ends_with("architecture.rs");
-            assert!(allowed || !text.contains(what), "{}: see tests/{place}", path.display());
+            let allowed = path.ends_with(file) || path.ends_with("architecture.rs");
+            assert!(allowed || !text.contains(what), "{}: see tests/{file}", path.display());
         }
     }
 }

@@ -48,7 +48,10 @@ fn lines() -> BTreeMap<String, usize> {
     let mut lines = BTreeMap::new();
     let all = ["src", "tests", "shaders-glsl", "scripts", "docs"].into_iter().flat_map(paths);
     for path in all.filter(|path| !path.starts_with("tests/fixtures")) {
-        if path.extension().is_some_and(|own| EXTENSIONS.iter().any(|known| own == *known)) {
+        if path
+            .extension()
+            .is_some_and(|extension| EXTENSIONS.iter().any(|known| extension == *known))
+        {
             let text = fs::read_to_string(Path::new(ROOT).join(&path)).unwrap();
             let written = text.lines().filter(|line| !line.trim().is_empty()).count();
             *lines.entry(row(&path)).or_default() += written;

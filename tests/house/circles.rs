@@ -111,8 +111,8 @@ fn used_siblings(sources: &BTreeMap<Module, Source>) -> BTreeMap<Module, BTreeSe
             let Some(target) = resolved(&source.module, path, sources) else { continue };
             let shared = source.module.iter().zip(&target).take_while(|(a, b)| a == b).count();
             if shared < source.module.len() && shared < target.len() {
-                let own = source.module[..=shared].to_vec();
-                used.entry(own).or_default().insert(target[..=shared].to_vec());
+                let module = source.module[..=shared].to_vec();
+                used.entry(module).or_default().insert(target[..=shared].to_vec());
             }
         }
     }

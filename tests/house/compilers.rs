@@ -34,11 +34,11 @@ fn a_spill_and_another_list_of_kernels_fail_and_more_instructions_are_a_warning(
         let output = python.env("NIGHTSPLAT_REQUIRE", "radv").output().unwrap();
         (output.status.code(), String::from_utf8(output.stdout).unwrap())
     };
-    let own = || line("own", json!({}));
-    let both = [own(), line("other", json!({ "spills": 3 }))];
+    let known = || line("own", json!({}));
+    let both = [known(), line("other", json!({ "spills": 3 }))];
     assert_eq!(compare(&both, Some("--write")).0, Some(0));
     assert_eq!(compare(&both, None).0, Some(0), "a spill that was there before");
-    let changed = |numbers| compare(&[own(), line("other", numbers)], None);
+    let changed = |numbers| compare(&[known(), line("other", numbers)], None);
     let (code, text) = changed(json!({ "spills": 3, "instructions": 111 }));
     assert!(
         code == Some(0) && text.contains("warning: navi: other: instructions 100 > 111"),

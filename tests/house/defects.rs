@@ -81,7 +81,7 @@ fn every_known_failure_is_a_test() {
     for (path, text) in files("scripts/known-failures", "txt") {
         for line in text.lines().filter(|line| !line.is_empty() && !line.starts_with('#')) {
             let name = line.trim_start_matches("skip ");
-            assert!(all.iter().any(|own| own == name), "{path:?}: {name}");
+            assert!(all.iter().any(|known| known == name), "{path:?}: {name}");
         }
     }
 }

@@ -81,11 +81,11 @@ fn options_in_documents_are_options_of_the_command() {
     use clap::CommandFactory;
 
     fn options(command: &clap::Command) -> BTreeSet<String> {
-        let own = command
+        let of_command = command
             .get_arguments()
             .flat_map(|it| it.get_long_and_visible_aliases().unwrap_or_default());
-        let own: BTreeSet<_> = own.map(str::to_owned).collect();
-        command.get_subcommands().map(options).fold(own, |all, more| &all | &more)
+        let of_command: BTreeSet<_> = of_command.map(str::to_owned).collect();
+        command.get_subcommands().map(options).fold(of_command, |all, more| &all | &more)
     }
     let mut command = nightsplat::cli::Cli::command();
     command.build();

@@ -22,8 +22,8 @@ fn term(gpu: &Gpu, [denoising, total_variation]: [f64; 2]) -> Result<DenoisingLo
 /// Views and their loss regions.
 fn cases() -> Vec<(UVec2, LossRegion)> {
     let whole = |size: [u32; 2]| (size.into(), LossRegion::whole(size.into()));
-    let inside = |size: [u32; 2], origin: [u32; 2], own: [u32; 2]| {
-        (size.into(), LossRegion { origin: origin.into(), size: own.into() })
+    let inside = |size: [u32; 2], origin: [u32; 2], region: [u32; 2]| {
+        (size.into(), LossRegion { origin: origin.into(), size: region.into() })
     };
     vec![
         whole([1, 1]),
@@ -40,14 +40,19 @@ fn cases() -> Vec<(UVec2, LossRegion)> {
 }
 
 /// Both terms by their definition, in double precision, with means over the loss region.
-fn loss_of(size: UVec2, LossRegion { origin, size: own }: LossRegion, a: &[f64], b: &[f64]) -> f64 {
+fn loss_of(
+    size: UVec2,
+    LossRegion { origin, size: region }: LossRegion,
+    a: &[f64],
+    b: &[f64],
+) -> f64 {
     let (mut squares, mut vertical, mut horizontal) = (0.0, 0.0, 0.0);
     let at = |channel: u32, x: u32, y: u32| {
         ((channel * size.y + origin.y + y) * size.x + origin.x + x) as usize
     };
     for channel in 0..3 {
-        for y in 0..own.y {
-            for x in 0..own.x {
+        for y in 0..region.y {
+            for x in 0..region.x {
                 let i = at(channel, x, y);
                 squares += (a[i] - b[i]).powi(2);
                 if y > 0 {
@@ -60,8 +65,9 @@ fn loss_of(size: UVec2, LossRegion { origin, size: own }: LossRegion, a: &[f64],
         }
     }
     let mean = |sum: f64, count: u32| if count == 0 { 0.0 } else { sum / f64::from(3 * count) };
-    let tv = 2.0 * (mean(vertical, own.x * (own.y - 1)) + mean(horizontal, (own.x - 1) * own.y));
-    WEIGHTS[0] * mean(squares, own.x * own.y) + WEIGHTS[1] * tv
+    let tv = 2.0
+        * (mean(vertical, region.x * (region.y - 1)) + mean(horizontal, (region.x - 1) * region.y));
+    WEIGHTS[0] * mean(squares, region.x * region.y) + WEIGHTS[1] * tv
 }
 
 struct Outcome {
@@ -97,18 +103,18 @@ fn the_terms_match_their_reference_and_finite_differences() {
     for (size, loss_region) in cases() {
         let values = 3 * size.element_product() as usize;
         let (denoised, render) = (noise(1, values, 0.0, 1.0), noise(2, values, -0.2, 1.2));
-        let own = loss_region.size;
+        let region_size = loss_region.size;
         let pair_scale = |pairs: u32| if pairs == 0 { 0.0 } else { 2.0 / (3 * pairs) as f32 };
         let params = denoising::Params {
             width: size.x,
             height: size.y,
             loss_begin: loss_region.origin,
-            loss_end: loss_region.origin + own,
+            loss_end: loss_region.origin + region_size,
             mse_weight: WEIGHTS[0] as f32,
             tv_weight: WEIGHTS[1] as f32,
-            mean_scale: 1.0 / (3 * own.element_product()) as f32,
-            x_scale: pair_scale((own.x - 1) * own.y),
-            y_scale: pair_scale(own.x * (own.y - 1)),
+            mean_scale: 1.0 / (3 * region_size.element_product()) as f32,
+            x_scale: pair_scale((region_size.x - 1) * region_size.y),
+            y_scale: pair_scale(region_size.x * (region_size.y - 1)),
         };
         let constants = denoising::Constants::default();
         let [d_denoised, d_render] = [0; 2].map(|_| vec![f32::NAN; values]);

@@ -57,8 +57,8 @@ fn exposures_explain_photographs_that_differ_in_brightness_and_their_mean_is_exa
         for c in 0..3 {
             // In the quanta of the parameters.
             let sum = |of: fn(&Affine, usize) -> f64| {
-                let quanta = |own: &Affine| (of(own, c) * 2f64.powi(21)).round();
-                exposures.iter().map(|(_, own)| quanta(own)).sum::<f64>()
+                let quanta = |affine: &Affine| (of(affine, c) * 2f64.powi(21)).round();
+                exposures.iter().map(|(_, affine)| quanta(affine)).sum::<f64>()
             };
             assert_eq!(sum(|e, c| e.gain[c].ln()), 0.0, "step {step}");
             assert_eq!(sum(|e, c| e.bias[c] / BIAS_SCALE), 0.0, "step {step}");
@@ -87,8 +87,8 @@ fn exposures_that_are_off_leave_no_kernel_and_no_file() {
         let (reports, checked) = trainer.check_step();
         reports.unwrap();
         checked.agree().unwrap();
-        let own = checked.passes.iter().filter(|pass| pass.kernel.starts_with("expos")).count();
-        assert_eq!(own, if learn { 4 } else { 0 });
+        let passes = checked.passes.iter().filter(|pass| pass.kernel.starts_with("expos")).count();
+        assert_eq!(passes, if learn { 4 } else { 0 });
         run::train(&gpu, &config, &dataset, &out, IfExists::Replace, |_| {}).unwrap();
         let exposures = run::load_exposures(&out).unwrap();
         let metrics = std::fs::read_to_string(out.join("metrics.json")).unwrap();
@@ -163,7 +163,7 @@ fn without_a_table_exposures_start_at_those_of_the_shared_points() {
     let (mut config, dataset) = varied(folder.path());
     let begin = |config: &TrainConfig| -> Vec<Affine> {
         let trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
-        trainer.exposures().unwrap().unwrap().into_iter().map(|(_, own)| own).collect()
+        trainer.exposures().unwrap().unwrap().into_iter().map(|(_, affine)| affine).collect()
     };
     let found = begin(&config);
     let planted = folder.path().join("planted.csv");

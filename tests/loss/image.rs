@@ -71,7 +71,9 @@ fn evaluate_loss_region(
 fn on_both_plans(test: impl Fn(&Gpu)) {
     static PLANS: OnceLock<[Gpu; 2]> = OnceLock::new();
     PLANS
-        .get_or_init(|| [true, false].map(|is_cpu| gpu_with(|own| own.is_cpu = is_cpu)))
+        .get_or_init(|| {
+            [true, false].map(|is_cpu| gpu_with(|properties| properties.is_cpu = is_cpu))
+        })
         .iter()
         .for_each(test);
 }
@@ -118,7 +120,7 @@ fn the_kernel_of_ssim_matches_its_reference_at_every_size() {
 /// With strips of 8 rows and, in the largest view, of 9.
 #[test]
 fn both_kernels_of_a_gpu_match_their_references() {
-    let gpu = gpu_with(|own| own.is_cpu = false);
+    let gpu = gpu_with(|properties| properties.is_cpu = false);
     let whole = |size: [u32; 2]| (size, LossRegion::whole(size.into()));
     let cases = SIZES.into_iter().chain([[120, 640]]).map(whole).chain(loss_regions());
     for (size, loss_region) in cases {
@@ -208,8 +210,8 @@ fn contains(LossRegion { origin, size }: LossRegion, x: usize, y: usize) -> bool
 
 /// Views with loss regions: all of it, the middle, a corner, one pixel.
 fn loss_regions() -> Vec<([u32; 2], LossRegion)> {
-    let inside = |size, origin: [u32; 2], own: [u32; 2]| {
-        (size, LossRegion { origin: origin.into(), size: own.into() })
+    let inside = |size, origin: [u32; 2], region: [u32; 2]| {
+        (size, LossRegion { origin: origin.into(), size: region.into() })
     };
     vec![
         inside([1, 1], [0, 0], [1, 1]),
@@ -316,8 +318,9 @@ fn a_loss_region_outside_the_view_is_refused() {
     let mut loss = loss(&gpu, 0.2).unwrap();
     loss.reserve(size).unwrap();
     let image = gpu.zeros("image", 3 * 64).unwrap();
-    for (origin, own) in [([0, 0], [0, 8]), ([1, 0], [8, 8]), ([9, 0], [1, 1]), ([0, 0], [8, 9])] {
-        let loss_region = LossRegion { origin: origin.into(), size: own.into() };
+    for (origin, region) in [([0, 0], [0, 8]), ([1, 0], [8, 8]), ([9, 0], [1, 1]), ([0, 0], [8, 9])]
+    {
+        let loss_region = LossRegion { origin: origin.into(), size: region.into() };
         let inputs = LossInputs { size, loss_region, render: &image, target: &image };
         let mut d_render = gpu.zeros("d_render", 3 * 64).unwrap();
         let logged = log_step(&gpu, |pass, log| loss.record(pass, inputs, &mut d_render, log));
@@ -494,7 +497,7 @@ fn a_second_term_adds_to_the_gradient_of_the_first() {
         for (size, weight) in [([40, 30], 0.2), ([37, 31], 0.2), ([37, 31], 0.0)] {
             let images = images(size);
             let first: Vec<f32> = (0..images[0].len()).map(|i| (i as f32 * 0.1).sin()).collect();
-            let own = evaluate(gpu, weight, size, &images).d_render;
+            let second = evaluate(gpu, weight, size, &images).d_render;
             let size = UVec2::from_array(size);
             let mut loss = Loss::new(gpu, weight, [Term::L1, Term::SSIM], Gradient::Added).unwrap();
             loss.reserve(size).unwrap();
@@ -507,7 +510,7 @@ fn a_second_term_adds_to_the_gradient_of_the_first() {
             })
             .unwrap();
             let expected: Vec<f32> =
-                first.iter().zip(own).map(|(first, own)| first + own).collect();
+                first.iter().zip(second).map(|(first, second)| first + second).collect();
             let what = format!("{size} {weight}");
             assert_close(&what, &gpu.read(&d_render).unwrap(), &expected, 2.0 * f32::EPSILON);
         }

@@ -22,8 +22,8 @@ fn masked(mut dataset: Dataset, hidden: Option<[f32; 3]>) -> Dataset {
         let weights = (0..width * height).map(|pixel| weight(pixel % width)).collect();
         view.mask = Some(Mask { width, height, weights });
         let paint = |image: &Image| {
-            let own = |x, y| hidden.filter(|_| weight(x) == 0.0).unwrap_or(image.pixel(x, y));
-            Image::from_fn(width, height, own)
+            let color = |x, y| hidden.filter(|_| weight(x) == 0.0).unwrap_or(image.pixel(x, y));
+            Image::from_fn(width, height, color)
         };
         view.image = view.image.as_ref().map(paint);
         view.reference = view.reference.as_ref().map(paint);
@@ -112,7 +112,7 @@ fn scores_are_those_of_the_unmasked_pixels() {
     let mask = Mask { width: size.0, height: size.1, weights };
     let left = |image: &Image| Image::from_fn(24, size.1, |x, y| image.pixel(x, y));
     let scores = Scores::of_counted(&render, &reference, Some(&mask)).unwrap();
-    let cut = Scores::of(&left(&render), &left(&reference)).unwrap();
+    let cut = Scores::measure(&left(&render), &left(&reference)).unwrap();
     assert!((scores.psnr - cut.psnr).abs() < 1e-9);
     assert!((scores.psnr_channel_mean - cut.psnr_channel_mean).abs() < 1e-9);
     // Except for the windows at the border, which include the reference beyond it.
@@ -125,7 +125,7 @@ fn scores_are_those_of_the_unmasked_pixels() {
     assert!((again.ssim - scores.ssim).abs() < 1e-12 && again.psnr == scores.psnr);
     assert_eq!(
         Scores::of_counted(&render, &reference, None).unwrap(),
-        Scores::of(&render, &reference).unwrap()
+        Scores::measure(&render, &reference).unwrap()
     );
     let nothing = Mask { weights: vec![0.0; mask.weights.len()], ..mask };
     assert!(Scores::of_counted(&render, &reference, Some(&nothing)).is_err());

@@ -140,10 +140,10 @@ fn frozen_attributes_have_no_gradient() {
     let (losses, all) = gradients(0);
     // The means are those of all Gaussians, frozen or not.
     for (attribute, frozen_columns) in [(Attribute::RawOpacities, 10), (Attribute::Dc, 11)] {
-        let (own, trained) = gradients(frozen_columns);
-        assert_eq!(own, losses);
+        let (losses_with_frozen, trained) = gradients(frozen_columns);
+        assert_eq!(losses_with_frozen, losses);
         let first = attribute.column(0) * count;
-        assert!(trained[..first].iter().all(|own| *own == 0.0));
+        assert!(trained[..first].iter().all(|gradient| *gradient == 0.0));
         assert!(trained[first..] == all[first..]);
     }
 }

@@ -50,7 +50,7 @@ fn every_kernel_agrees_with_its_reference_at_every_size() {
             }
             // Half of the values are at their targets.
             let mut exposed = noise(6, 3 * pixels, 0.0, 1.0);
-            exposed.iter_mut().zip(&target).step_by(2).for_each(|(own, &target)| *own = target);
+            exposed.iter_mut().zip(&target).step_by(2).for_each(|(value, &target)| *value = target);
             let partials = vec![Vec2::NAN; 3 * chunk_count as usize];
             let expected = d_render[3 * pixels..].to_vec();
             let (d_render, partials) = run_kernel!(
@@ -71,8 +71,8 @@ fn every_kernel_agrees_with_its_reference_at_every_size() {
                 [partials],
                 [gradients]
             );
-            let own = view as usize * WIDTH..(view as usize + 1) * WIDTH;
-            let others = gradients.iter().enumerate().filter(|(at, _)| !own.contains(at));
+            let range = view as usize * WIDTH..(view as usize + 1) * WIDTH;
+            let others = gradients.iter().enumerate().filter(|(at, _)| !range.contains(at));
             assert!(others.into_iter().all(|(_, &gradient)| gradient == 0.0));
         }
     }
@@ -153,7 +153,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     let start = &three();
     let mut exposures = Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE; 3]).unwrap();
     exposures.reserve(size).unwrap();
-    let own = exposures.affines().unwrap()[1];
+    let exact = exposures.affines().unwrap()[1];
     let render_on_device = gpu.buffer("render", &render).unwrap();
     let target = gpu.zeros("target", render.len()).unwrap();
     let mut d_render = gpu.buffer("d_render", &crate::common::narrow(&weights)).unwrap();
@@ -175,7 +175,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     };
     for number in 0..WIDTH {
         let moved = |by: f64| {
-            let mut affine = own;
+            let mut affine = exact;
             match number {
                 0..3 => affine.gain[number] *= by.exp(),
                 _ => affine.bias[number - 3] += BIAS_SCALE * by,
@@ -195,7 +195,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     let gradient = downstream.run(&parameters).gradient;
     let mut exposed = Chain::new(&setup);
     for (i, weight) in exposed.d_render.iter_mut().enumerate() {
-        *weight *= own.gain[i / pixels];
+        *weight *= exact.gain[i / pixels];
     }
     let largest = gradient.iter().fold(0.0f64, |largest, d| largest.max(d.abs()));
     for at in 0..parameters.len() {
@@ -223,7 +223,7 @@ fn the_gradient_of_clipped_values_is_its_central_difference() {
     let mut exposures =
         Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE, white, WHITE]).unwrap();
     exposures.reserve(size).unwrap();
-    let own = exposures.affines().unwrap()[1];
+    let exact = exposures.affines().unwrap()[1];
     let [on_device, target_on_device] =
         [&render, &target].map(|values| gpu.buffer("image", values).unwrap());
     let mut d_render = gpu.buffer("d_render", &weights).unwrap();
@@ -242,7 +242,7 @@ fn the_gradient_of_clipped_values_is_its_central_difference() {
     let mut bound = 0;
     for (i, &c) in render.iter().enumerate() {
         let difference =
-            exposed(&own, i, f64::from(c) + 1e-4) - exposed(&own, i, f64::from(c) - 1e-4);
+            exposed(&exact, i, f64::from(c) + 1e-4) - exposed(&exact, i, f64::from(c) - 1e-4);
         let expected = f64::from(weights[i]) * difference / 2e-4;
         assert!(
             (f64::from(d_render[i]) - expected).abs() < 1e-5,
@@ -254,7 +254,7 @@ fn the_gradient_of_clipped_values_is_its_central_difference() {
     assert!((20..160).contains(&bound), "{bound} values are bound by their targets");
     for number in 0..WIDTH {
         let loss = |by: f64| -> f64 {
-            let mut affine = own;
+            let mut affine = exact;
             match number {
                 0..3 => affine.gain[number] *= by.exp(),
                 _ => affine.bias[number - 3] += BIAS_SCALE * by,

@@ -84,8 +84,10 @@ fn networks_of_another_configuration_are_refused_and_nothing_changes() {
         let before = values(&others);
         let error = load_both(&path, &mut others).unwrap_err().to_string();
         let remedy = r#"use the settings it was made with: {"stages":2,"repeats":1,"channels":4,"#;
-        let own = serde_json::to_string(&settings).unwrap();
-        for part in facts.iter().copied().chain(["networks.safetensors", remedy, own.as_str()]) {
+        let settings_of_run = serde_json::to_string(&settings).unwrap();
+        for part in
+            facts.iter().copied().chain(["networks.safetensors", remedy, settings_of_run.as_str()])
+        {
             assert!(error.contains(part), "{part}: {error}");
         }
         assert_eq!(error.lines().count(), 1, "{error}");

@@ -65,8 +65,8 @@ fn packed_weights(
     values: &[f32],
 ) -> (Vec<u32>, Vec<[u32; 4]>) {
     let bits = largest(values, [offset, 9 * in_channels * out_channels]);
-    let own = [in_channels, out_channels].map(|count| count.next_multiple_of(PACKED_CHANNELS));
-    let eights = 9 * own[0] * own[1] / 8;
+    let padded = [in_channels, out_channels].map(|count| count.next_multiple_of(PACKED_CHANNELS));
+    let eights = 9 * padded[0] * padded[1] / 8;
     let (values, packed) = (values.to_vec(), vec![UNWRITTEN; eights as usize]);
     let packed = {
         let largest = bits.clone();

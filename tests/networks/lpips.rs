@@ -7,7 +7,7 @@ use glam::UVec2;
 use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::*;
-use nightsplat::networks::lpips::{Lpips, Measure, Network, Range};
+use nightsplat::networks::lpips::{Lpips, LpipsVersion, Network, Range};
 use nightsplat::photographs::image::Image;
 
 use crate::common::lpips::{noise, write};
@@ -29,7 +29,7 @@ fn assert_distances(network: Network, range: Range, expected: &[Expected]) {
     let path = folder.path().join("lpips.safetensors");
     write(network, &path, |_, _, _| {});
     let lpips = Lpips::load(&gpu(), &path, range).unwrap();
-    assert_eq!(lpips.measure(), Measure { network, range }, "told by its tensors");
+    assert_eq!(lpips.measure(), LpipsVersion { network, range }, "told by its tensors");
     for &(width, height, far, near) in expected {
         let (a, b) = (picture(width, height, 100), picture(width, height, 200));
         let mix = a.data.iter().zip(&b.data).map(|(a, b)| 0.9 * a + 0.1 * b).collect();
@@ -137,9 +137,9 @@ fn weights_of_another_network_are_named() {
 
 #[test]
 fn every_measure_has_its_own_key() {
-    let keys: Vec<String> = Measure::all().map(Measure::key).collect();
+    let keys: Vec<String> = LpipsVersion::all().map(LpipsVersion::key).collect();
     assert_eq!(keys, ["lpips", "lpips_alex_unit", "lpips_vgg_signed", "lpips_vgg_unit"]);
-    let titles: Vec<String> = Measure::all().map(Measure::title).collect();
+    let titles: Vec<String> = LpipsVersion::all().map(LpipsVersion::title).collect();
     assert_eq!(titles, ["LPIPS", "LPIPS alex unit", "LPIPS vgg signed", "LPIPS vgg unit"]);
 }
 

@@ -3,7 +3,7 @@
 use nightsplat::networks::{DenoiserSettings, NetworkVariant};
 use nightsplat::reference::conv3x3::{activate, conv3x3, data_gradient};
 use nightsplat::reference::conv3x3_weight_gradient::weight_gradient;
-use nightsplat::reference::norm::{self, Affine, Statistics};
+use nightsplat::reference::norm::{self, NormAffine, NormStatistics};
 use nightsplat::reference::residual::residual;
 use nightsplat::reference::residual_backward::clamp_backward;
 
@@ -95,9 +95,9 @@ impl Denoiser {
         (convs, norm)
     }
 
-    fn affine(self, values: &[f64], norm: usize, channel: usize) -> Affine {
+    fn affine(self, values: &[f64], norm: usize, channel: usize) -> NormAffine {
         let channels = self.settings.channels as usize;
-        Affine { gamma: values[norm + channel], beta: values[norm + channels + channel] }
+        NormAffine { gamma: values[norm + channel], beta: values[norm + channels + channel] }
     }
 
     fn stages(self, values: &[f64], noise: &[f64], render: &[f64]) -> Vec<Stage> {
@@ -113,7 +113,10 @@ impl Denoiser {
                 let mut f = features[repeat].clone();
                 for (channel, z) in z.chunks(pixels).enumerate() {
                     let affine = self.affine(values, norm, channel);
-                    add(&mut f[channel * pixels..], &norm::forward(Statistics::of(z), affine, z));
+                    add(
+                        &mut f[channel * pixels..],
+                        &norm::forward(NormStatistics::from_values(z), affine, z),
+                    );
                 }
                 features.push(f);
                 convolved.push(z);
@@ -169,7 +172,7 @@ impl Denoiser {
                 let per_channel = stage.convolved[repeat].chunks(pixels).zip(d_f.chunks(pixels));
                 for (channel, (z, d)) in per_channel.enumerate() {
                     let affine = self.affine(values, norm, channel);
-                    let statistics = Statistics::of(z);
+                    let statistics = NormStatistics::from_values(z);
                     let sums = norm::backward_sums(statistics, affine, z, d);
                     let channels = self.settings.channels as usize;
                     gradients[norm + channel] += sums[1];

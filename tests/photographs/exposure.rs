@@ -2,7 +2,9 @@
 
 use glam::{DAffine3, DVec2, DVec3};
 use nightsplat::camera::{Camera, CameraModel};
-use nightsplat::photographs::tone::{Exposure, LuminanceHistogram, Statistics, exposed_anew, soft};
+use nightsplat::photographs::tone::{
+    Exposure, LuminanceHistogram, Statistics, exposure_knots, soft,
+};
 
 /// A reproducible photograph with luminance close to black, planar; `contrast` is the exponent of its distribution.
 fn photograph(pixels: usize, brightness: f32, contrast: i32, seed: u64) -> Vec<f32> {
@@ -49,8 +51,8 @@ fn slow_gain(luminances: &[f64]) -> f64 {
 }
 
 fn exposure(views: &[Vec<f32>]) -> Option<Exposure> {
-    let views: Vec<_> = views.iter().map(|view| LuminanceHistogram::of(view)).collect();
-    Exposure::of(&views, None)
+    let views: Vec<_> = views.iter().map(|view| LuminanceHistogram::new(view)).collect();
+    Exposure::measure(&views, None)
 }
 
 #[test]
@@ -73,7 +75,7 @@ fn the_gain_agrees_with_a_search_over_all_pixels() {
 
 #[test]
 fn the_mean_rises_with_the_gain_and_with_the_requested_brightness() {
-    let views = [1, 2, 3].map(|seed| LuminanceHistogram::of(&photograph(5000, 0.2, 3, seed)));
+    let views = [1, 2, 3].map(|seed| LuminanceHistogram::new(&photograph(5000, 0.2, 3, seed)));
     let mut last = 0.0;
     for gain in (-20..=20).map(|step| f64::from(step).exp2().powf(0.35)) {
         let mean = views[0].mean_of(|y| soft(y, gain));
@@ -82,7 +84,7 @@ fn the_mean_rises_with_the_gain_and_with_the_requested_brightness() {
     }
     let mut last = 0.0;
     for brightness in [0.2, 0.4, 0.5, 0.7, 0.9] {
-        let exposure = Exposure::of(&views, Some(brightness)).unwrap();
+        let exposure = Exposure::measure(&views, Some(brightness)).unwrap();
         assert!((exposure.target - brightness).abs() < 1e-9);
         assert_eq!(exposure.weight(), 1.0);
         assert!(exposure.gain > last);
@@ -93,7 +95,7 @@ fn the_mean_rises_with_the_gain_and_with_the_requested_brightness() {
 #[test]
 fn darker_views_have_a_higher_gain_and_equal_ones_the_scene_s() {
     let view = photograph(20_000, 0.1, 2, 7);
-    let histogram = LuminanceHistogram::of(&view);
+    let histogram = LuminanceHistogram::new(&view);
     let equal = exposure(&vec![view.clone(); 3]).unwrap();
     assert_eq!(equal.spread, 0.0);
     assert!((equal.gain_of(&histogram, None) / equal.gain - 1.0).abs() < 1e-9);
@@ -107,7 +109,7 @@ fn darker_views_have_a_higher_gain_and_equal_ones_the_scene_s() {
     assert!(varied.share > 0.95 && varied.share < 1.0);
     // Almost all of the difference is compensated: the targets are equally bright.
     let means = views.each_ref().map(|view| {
-        let histogram = LuminanceHistogram::of(view);
+        let histogram = LuminanceHistogram::new(view);
         histogram.mean_of(|y| soft(y, varied.gain_of(&histogram, None)))
     });
     let [low, high] = [f64::min, f64::max].map(|of| means.into_iter().reduce(of).unwrap());
@@ -132,9 +134,9 @@ fn camera(step: usize) -> Camera {
 fn gains_along(factors: &[f32]) -> (Vec<f64>, f64) {
     let view = photograph(20_000, 0.1, 2, 7);
     let views: Vec<_> =
-        factors.iter().map(|&factor| LuminanceHistogram::of(&scaled(&view, factor))).collect();
+        factors.iter().map(|&factor| LuminanceHistogram::new(&scaled(&view, factor))).collect();
     let seen = views.iter().enumerate().map(|(i, view)| (view, camera(i)));
-    let exposure = Exposure::of(&views, None).unwrap().seen_by(seen);
+    let exposure = Exposure::measure(&views, None).unwrap().seen_by(seen);
     let gain = |(i, view)| exposure.gain_of(view, Some(&camera(i)));
     (views.iter().enumerate().map(gain).collect(), exposure.share)
 }
@@ -163,10 +165,10 @@ fn neighbouring_views_have_similar_gains_unless_their_exposures_differ() {
 #[test]
 fn a_view_beyond_all_others_has_the_gain_of_the_nearest() {
     let views: Vec<_> = [1.0, 0.8]
-        .map(|factor| LuminanceHistogram::of(&scaled(&photograph(20_000, 0.1, 2, 7), factor)))
+        .map(|factor| LuminanceHistogram::new(&scaled(&photograph(20_000, 0.1, 2, 7), factor)))
         .into();
     let seen = views.iter().enumerate().map(|(i, view)| (view, camera(100 * i)));
-    let exposure = Exposure::of(&views, None).unwrap().seen_by(seen);
+    let exposure = Exposure::measure(&views, None).unwrap().seen_by(seen);
     let [near, far] = [0, 1].map(|i| exposure.gain_of(&views[i], Some(&camera(100 * i))));
     let beyond = exposure.gain_of(&views[1], Some(&camera(100_000)));
     assert!(far > near && (beyond / far - 1.0).abs() < 1e-9, "{beyond}, not {far}");
@@ -177,7 +179,7 @@ fn a_view_beyond_all_others_has_the_gain_of_the_nearest() {
 fn an_image_at_one_gain_is_converted_to_another() {
     for gains in [[10.0, 14.0], [14.0, 10.0], [3.0, 60.0], [8.0, 8.0]] {
         for weight in [1.0, 0.4] {
-            let knots = exposed_anew(gains, weight);
+            let knots = exposure_knots(gains, weight);
             assert!(knots.is_sorted_by(|a, b| a[0] <= b[0] && a[1] <= b[1]), "{gains:?}");
             for x in [0.0, 0.001, 0.02, 0.1, 0.3] {
                 let [from, to] =
@@ -209,7 +211,7 @@ fn black_views_are_left_out_and_a_black_set_has_no_exposure() {
     let with = exposure(&[good.clone(), black.clone(), vec![0.0; 3000]]).unwrap();
     let without = exposure(&[good]).unwrap();
     assert_eq!((with.gain, with.black), (without.gain, 2));
-    assert_eq!(with.gain_of(&LuminanceHistogram::of(&black), None), with.gain);
+    assert_eq!(with.gain_of(&LuminanceHistogram::new(&black), None), with.gain);
     assert!(with.reason().contains("2 almost black"), "{}", with.reason());
     assert_eq!(exposure(&[black, vec![0.0; 3000]]), None);
     assert_eq!(exposure(&[]), None);
@@ -241,8 +243,8 @@ fn a_well_lit_set_has_no_curve_and_one_between_a_blend() {
 fn the_histogram_has_the_mean_of_the_statistics() {
     for (brightness, contrast) in [(0.05, 2), (0.3, 4), (1.0, 1)] {
         let planes = photograph(30_000, brightness, contrast, 11);
-        let mean = f64::from(Statistics::of(&planes).mean_luminance);
-        let found = LuminanceHistogram::of(&planes).mean();
+        let mean = f64::from(Statistics::new(&planes).mean_luminance);
+        let found = LuminanceHistogram::new(&planes).mean();
         assert!((found / mean - 1.0).abs() < 3e-4, "{found}, not {mean}");
     }
 }

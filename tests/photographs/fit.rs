@@ -7,7 +7,7 @@ mod profile;
 use nightsplat::Error;
 use nightsplat::base::random::Stream;
 use nightsplat::photographs::fit::{
-    Channels, Fit, FitOptions, FitScene, Pair, Weighting, cross_validate, fit, psnr,
+    Channels, CurveFit, FitOptions, FitScene, Pair, Weighting, cross_validate, fit, psnr,
 };
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::tone::{FAMILIES, Family, Statistics, ToneCurve, ToneSettings, White};
@@ -27,7 +27,7 @@ fn dark(size: u32, scale: f64, floor: f64, seed: u64) -> Image {
 /// A photograph under the curve, with normal noise.
 fn reference(settings: &ToneSettings, dark: &Image, noise: f64, seed: u64) -> Image {
     let stream = Stream::new(seed, 2);
-    let parameters = settings.parameters(&Statistics::of(&dark.data));
+    let parameters = settings.parameters(&Statistics::new(&dark.data));
     let plane = dark.pixel_count();
     let data = dark.data.iter().enumerate().map(|(index, &x)| {
         let y = if settings.curve == ToneCurve::PerChannel {
@@ -44,7 +44,7 @@ fn pair(settings: &ToneSettings, dark: &Image, noise: f64, seed: u64) -> Pair {
     Pair::new(format!("{seed}.png"), dark, &reference(settings, dark, noise, seed)).unwrap()
 }
 
-fn fit_to(family: &'static Family, pairs: &[Pair], options: &FitOptions) -> Fit {
+fn fit_to(family: &'static Family, pairs: &[Pair], options: &FitOptions) -> CurveFit {
     fit(family, &pairs.iter().collect::<Vec<_>>(), options).unwrap()
 }
 
@@ -183,7 +183,7 @@ fn robust_weights_withstand_pixels_that_do_not_match() {
         }
     }
     let pairs = [Pair::new("moved", &dark, &moved).unwrap()];
-    let worst = |found: &Fit| {
+    let worst = |found: &CurveFit| {
         let error = |i: i32| {
             let value =
                 |constants: &[f64]| family.curve.value(0.05 * f64::from(i), 0.0, 1.0, constants);
@@ -266,7 +266,7 @@ fn photographs_that_disagree_count_as_fewer_values() {
         [agreeing, disagreeing].map(|pairs| fit_to(family, &pairs, &PLAIN));
     assert!(agreeing.effective_values > 0.1 * agreeing.values);
     assert!(disagreeing.effective_values < 20.0, "{}", disagreeing.effective_values);
-    let error = |fit: &Fit| fit.constants[0].standard_error.unwrap();
+    let error = |fit: &CurveFit| fit.constants[0].standard_error.unwrap();
     assert!(error(&disagreeing) > 10.0 * error(&agreeing));
 }
 
@@ -274,7 +274,7 @@ fn photographs_that_disagree_count_as_fewer_values() {
 #[test]
 fn a_fit_rises_and_stays_below_white_if_required() {
     let dark = dark(128, 0.05, 0.0, 3);
-    let p90 = Statistics::of(&dark.data).p90;
+    let p90 = Statistics::new(&dark.data).p90;
     let hump = dark.data.iter().map(|x| {
         let t = x / p90;
         (1.3 * t * (2.0 - t)).clamp(0.2, 1.0)

@@ -136,8 +136,8 @@ fn in_a_single_listing_every_eighth_view_by_name_is_a_test_view() {
 
 #[test]
 fn a_frames_own_intrinsics_override_and_views_may_differ_in_size() {
-    let own = json!({ "w": 64, "h": 50.0, "camera_angle_x": 1.0, "cx": 30.0 });
-    let folder = Folder::with_listing(4, |listing| extend(&mut listing["frames"][1], &own));
+    let intrinsics = json!({ "w": 64, "h": 50.0, "camera_angle_x": 1.0, "cx": 30.0 });
+    let folder = Folder::with_listing(4, |listing| extend(&mut listing["frames"][1], &intrinsics));
     photograph(&folder.join("images/v01.png"), (64, 50), 0.1);
     let dataset = load(&folder);
     let camera = view(&dataset, "v01").camera;

@@ -87,12 +87,12 @@ fn the_references_are_in_even_light() {
         let without = written(&SyntheticOptions { lamp: None, ..set }, &Capture::default());
         assert!(!without.path().join("lit").exists());
         for view in ["000", "007"] {
-            let [a, b, own] = [&narrow, &wide, &without]
+            let [a, b, unlit] = [&narrow, &wide, &without]
                 .map(|set| image(set.path(), &format!("high/{view}.png")));
             assert!(a.data == b.data, "{view}");
             // Shading and shadows make the darkest surfaces darker.
             let dark = |image: &Image| green(image).into_iter().filter(|&x| x < 0.03).count();
-            assert!(dark(&a) < dark(&own), "{view}: {} pixels, {}", dark(&a), dark(&own));
+            assert!(dark(&a) < dark(&unlit), "{view}: {} pixels, {}", dark(&a), dark(&unlit));
         }
     }
 }

@@ -22,7 +22,7 @@ fn pattern(width: u32, height: u32) -> (Image, Image) {
 fn scores_equal_those_of_a_plain_two_dimensional_convolution() {
     // From a direct sum over the 11x11 window in double precision, written independently in Python.
     let (render, reference) = pattern(13, 9);
-    let scores = Scores::of(&render, &reference).unwrap();
+    let scores = Scores::measure(&render, &reference).unwrap();
     assert!((scores.psnr - 20.209_237_797_326_722).abs() < 1e-9, "{scores:?}");
     assert!((scores.psnr_channel_mean - 20.214_985_247_465_577).abs() < 1e-9, "{scores:?}");
     assert!((scores.ssim - 0.959_258_159_401_484).abs() < 1e-9, "{scores:?}");
@@ -31,7 +31,7 @@ fn scores_equal_those_of_a_plain_two_dimensional_convolution() {
 #[test]
 fn an_image_equals_itself() {
     let (image, _) = pattern(16, 12);
-    let scores = Scores::of(&image, &image).unwrap();
+    let scores = Scores::measure(&image, &image).unwrap();
     assert_eq!((scores.psnr, scores.psnr_channel_mean), (f64::INFINITY, f64::INFINITY));
     assert!((scores.ssim - 1.0).abs() < 1e-12);
 }
@@ -55,9 +55,9 @@ fn images_of_different_sizes_are_refused_with_both_sizes() {
 #[test]
 fn empty_and_truncated_images_are_refused() {
     let empty = Image { width: 0, height: 0, data: Vec::new() };
-    assert!(Scores::of(&empty, &empty).is_err());
+    assert!(Scores::measure(&empty, &empty).is_err());
     let short = Image { width: 2, height: 2, data: vec![0.0; 11] };
-    assert!(Scores::of(&short, &short).is_err());
+    assert!(Scores::measure(&short, &short).is_err());
 }
 
 #[test]
@@ -82,7 +82,7 @@ fn scores_agree_with_the_scoring_script() {
         image.save_png8(folder.join("a.png")).unwrap();
     }
     let load = |folder: &Path| Image::load(folder.join("a.png")).unwrap();
-    let ours = Scores::of(&load(&renders), &load(&references)).unwrap();
+    let ours = Scores::measure(&load(&renders), &load(&references)).unwrap();
     let output = Command::new("python3")
         .arg(&script)
         .args([&renders, &references])

@@ -69,10 +69,10 @@ proptest! {
         let (mut x, mut y, mut text) = (0.0, vec![0.0], "t,y\n0,0\n".to_owned());
         let rise: f64 = steps.iter().map(|(_, rise)| rise).sum::<f64>().max(1e-9);
         let mut knots = vec![0.0];
-        for (width, own) in steps {
+        for (width, step) in steps {
             x += width;
             knots.push(x);
-            y.push((y[y.len() - 1] + own / rise).min(1.0));
+            y.push((y[y.len() - 1] + step / rise).min(1.0));
             text += &format!("{x},{}\n", y[y.len() - 1]);
         }
         let table = Table::from_csv(&text).map_err(TestCaseError::fail)?;
@@ -108,13 +108,13 @@ proptest! {
         prop_assert!(back.distance(world) <= 1e-9 * (world.length() + extent), "{back}, not {world}");
         let view_from_world = camera.view_from_world * DAffine3::from_translation(-center);
         let camera = Camera { view_from_world, ..camera };
-        let (own, framed) = (camera.project(world), frame.camera(&camera).project(frame.framed(world)));
-        prop_assert_eq!(own.is_some(), framed.is_some());
-        if let Some((own, framed)) = own.zip(framed) {
+        let (projected, framed) = (camera.project(world), frame.camera(&camera).project(frame.framed(world)));
+        prop_assert_eq!(projected.is_some(), framed.is_some());
+        if let Some((projected, framed)) = projected.zip(framed) {
             let depth = camera.view_from_world.transform_point3(world).z;
             let scale = world.length() + extent * 5.0 + 10.0;
-            let bound = 1e-13 * scale / depth * (own.length() + camera.focal.max_element()) + 1e-9;
-            prop_assert!(own.distance(framed) <= 64.0 * bound, "{own} and {framed}");
+            let bound = 1e-13 * scale / depth * (projected.length() + camera.focal.max_element()) + 1e-9;
+            prop_assert!(projected.distance(framed) <= 64.0 * bound, "{projected} and {framed}");
         }
     }
 
@@ -157,11 +157,11 @@ proptest! {
         }).unwrap();
         let mask = if bits == 0 { 0 } else { u32::MAX >> (32 - bits) };
         let mut order: Vec<u32> = (0..count as u32).collect();
-        order.sort_by_key(|&place| keys[place as usize] & mask);
+        order.sort_by_key(|&index| keys[index as usize] & mask);
         prop_assert_eq!(&gpu.read(&values).unwrap()[..count], &order[..]);
-        let sums: Vec<u32> = small[..count].iter().scan(0, |sum, own| {
-            *sum += own;
-            Some(*sum - own)
+        let sums: Vec<u32> = small[..count].iter().scan(0, |sum, value| {
+            *sum += value;
+            Some(*sum - value)
         }).collect();
         prop_assert_eq!(&gpu.read(&offsets).unwrap()[..count], &sums[..]);
         prop_assert_eq!(gpu.read(&total).unwrap(), [small[..count].iter().sum::<u32>()]);
@@ -173,7 +173,7 @@ proptest! {
         count in 0..6_usize,
     ) {
         let mut gaussians = Gaussians::zeros(count, sh_degree);
-        gaussians.parameters.iter_mut().zip(numbers).for_each(|(own, number)| *own = number);
+        gaussians.parameters.iter_mut().zip(numbers).for_each(|(parameter, number)| *parameter = number);
         let folder = tempfile::tempdir().unwrap();
         ply::save(&gaussians, folder.path().join("a.ply")).unwrap();
         prop_assert_eq!(ply::load(folder.path().join("a.ply")).unwrap(), gaussians);
@@ -227,7 +227,7 @@ proptest! {
             }
             let found: Vec<DVec3> = dataset.points.iter().map(|point| point.position).collect();
             prop_assert!(found.is_empty() == root.ends_with("json"));
-            prop_assert!(found.iter().all(|at| points.iter().any(|own| own.abs_diff_eq(*at, 1e-8))));
+            prop_assert!(found.iter().all(|at| points.iter().any(|point| point.abs_diff_eq(*at, 1e-8))));
         }
     }
 }

@@ -44,7 +44,7 @@ fn a_curve_agrees_with_the_host_from_tiny_to_huge_values() {
 /// The tone mapping of a single photograph, and its target on the device.
 fn tone_mapped(gpu: &Gpu, settings: &ToneSettings, photograph: &Image) -> (ToneMapping, Image) {
     let tone_mapping =
-        SceneTone::new(settings).mapping_of(&MeasuredPhotograph::of(&photograph.data));
+        SceneTone::new(settings).mapping_of(&MeasuredPhotograph::measure(&photograph.data));
     let pseudo_gt = PseudoGt::new(gpu, settings).unwrap();
     (tone_mapping, pseudo_gt.tone_mapped(photograph, &tone_mapping).unwrap())
 }

@@ -56,9 +56,9 @@ fn every_part_of_the_street_has_points_that_many_views_see() {
     let dataset = loaded(written(PLOTS).path());
     for plot in 0..PLOTS {
         let plot = f64::from(plot);
-        let own =
+        let of_part =
             dataset.points.iter().filter(|point| (plot..plot + 1.0).contains(&point.position.x));
-        let tracks: Vec<usize> = own.map(|point| point.views.len()).collect();
+        let tracks: Vec<usize> = of_part.map(|point| point.views.len()).collect();
         let views = tracks.iter().sum::<usize>() as f64 / tracks.len() as f64;
         assert!(
             tracks.len() > 150 && views > 5.0,
@@ -103,8 +103,8 @@ fn every_eighth_view_is_a_test_view_and_they_are_all_along_the_street_and_in_eve
             .all(|(index, view)| { (view.split == Split::Test) == (index % 8 == 0) })
     );
     for lane in [-1.0, 0.0, 1.0] {
-        let own = centers.iter().filter(|center| (center.y - 1.15 * lane).abs() < 0.2).count();
-        assert_eq!(own, 3, "lane {lane}");
+        let in_lane = centers.iter().filter(|center| (center.y - 1.15 * lane).abs() < 0.2).count();
+        assert_eq!(in_lane, 3, "lane {lane}");
     }
     assert!(centers[0].x < 0.5 && centers[8].x > 10.0, "{centers:?}");
 }

@@ -116,7 +116,7 @@ fn the_f32_curves_agree_with_the_f64_curves() {
 #[test]
 fn nan_and_negative_values_map_into_the_range() {
     for curve in ToneCurve::ALL {
-        let parameters = ToneSettings::new(curve).parameters(&Statistics::of(&[0.1; 12]));
+        let parameters = ToneSettings::new(curve).parameters(&Statistics::new(&[0.1; 12]));
         for x in [f32::NAN, f32::NEG_INFINITY, -1.0, -1e-9, f32::INFINITY, f32::MAX] {
             let y = curve.apply(x, &parameters);
             assert!((0.0..=1.0).contains(&y), "{curve}({x}) = {y}");
@@ -126,7 +126,7 @@ fn nan_and_negative_values_map_into_the_range() {
         assert!(of_nan == 0.0 || of_nan == curve.apply(0.0, &parameters), "{curve}: {of_nan}");
     }
     for curve in PAPER {
-        let parameters = ToneSettings::new(curve).parameters(&Statistics::of(&[0.1; 12]));
+        let parameters = ToneSettings::new(curve).parameters(&Statistics::new(&[0.1; 12]));
         assert_eq!(curve.apply(f32::NAN, &parameters), 0.0);
         assert_eq!(curve.value(f64::NAN, 0.1, 1.0, &[]), 0.0);
     }
@@ -193,7 +193,7 @@ fn percentiles_interpolate_between_the_neighbours_of_the_rank() {
 #[test]
 fn statistics_are_those_of_encoded_bt601_luminance() {
     // Two pixels: pure red, pure blue.
-    let statistics = Statistics::of(&[1.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
+    let statistics = Statistics::new(&[1.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
     assert!((statistics.mean_luminance - (0.299 + 0.114) / 2.0).abs() < 1e-7);
     assert!((statistics.mean - 1.0 / 3.0).abs() < 1e-7);
     assert!((statistics.p10 - (0.114 + 0.1 * 0.185 + 1e-6)).abs() < 1e-7);
@@ -213,7 +213,7 @@ fn degenerate_photographs_have_finite_curves() {
         ("not finite", vec![f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0, 0.5, 1e30]),
     ];
     for (name, planes) in photographs {
-        let statistics = Statistics::of(&planes);
+        let statistics = Statistics::new(&planes);
         let Statistics { p10, p90, mean_luminance, mean, .. } = statistics;
         assert!(
             [p10, p90, mean_luminance, mean].iter().all(|x| x.is_finite()),
@@ -237,7 +237,7 @@ fn degenerate_photographs_have_finite_curves() {
 #[test]
 fn a_constant_photograph_has_no_offset_and_black_stays_black() {
     for planes in [[0.0; 12], [0.2; 12], [1.0; 12]] {
-        let statistics = Statistics::of(&planes);
+        let statistics = Statistics::new(&planes);
         assert_eq!(statistics.ratio(), 1.0);
         for curve in ToneCurve::ALL {
             let parameters = ToneSettings::new(curve).parameters(&statistics);
@@ -253,7 +253,7 @@ fn a_constant_photograph_has_no_offset_and_black_stays_black() {
 fn the_linear_curve_scales_the_mean_to_theta() {
     let planes: Vec<f32> = (0..300).map(|i| i as f32 / 6000.0).collect();
     let settings = ToneSettings { theta: 0.3, ..ToneSettings::new(ToneCurve::Linear) };
-    let parameters = settings.parameters(&Statistics::of(&planes));
+    let parameters = settings.parameters(&Statistics::new(&planes));
     let sum: f32 = planes.iter().map(|&x| settings.curve.apply(x, &parameters)).sum();
     assert!((sum / 300.0 - 0.3).abs() < 1e-5);
 }
@@ -268,7 +268,7 @@ const KNOWN_STATISTICS: [(&str, [f64; 5]); 3] = [
 #[test]
 fn the_statistics_agree_with_independent_values() {
     for (name, expected) in KNOWN_STATISTICS {
-        let statistics = Statistics::of(&load(&fixture("lom/low").join(name)));
+        let statistics = Statistics::new(&load(&fixture("lom/low").join(name)));
         let [p10, p90] = statistics.percentiles();
         let delta0 = ToneSettings::new(ToneCurve::Ap3).offset(statistics.printed_ratio());
         let means = [statistics.mean_luminance, statistics.mean].map(f64::from);
@@ -290,7 +290,7 @@ fn the_training_photographs_have_the_statistics_of_the_paper() {
         let settings = ToneSettings::new(ToneCurve::Ap3);
         let mut mean = [0.0; 4];
         for name in &names {
-            let statistics = Statistics::of(&load(&lom.join(scene).join("low").join(name)));
+            let statistics = Statistics::new(&load(&lom.join(scene).join("low").join(name)));
             let ratio = statistics.printed_ratio();
             let values = [
                 statistics.percentiles()[1],
@@ -338,7 +338,7 @@ fn score_of_curve(scene: &Path, curve: ToneCurve, gain_c: f64) -> f64 {
     let names = names(scene, "test");
     let scores = names.iter().map(|name| {
         let [low, high] = ["low", "high"].map(|folder| load(&scene.join(folder).join(name)));
-        let parameters = settings.parameters(&Statistics::of(&low));
+        let parameters = settings.parameters(&Statistics::new(&low));
         let target: Vec<f32> = low.iter().map(|&x| curve.apply(x, &parameters)).collect();
         psnr(&target, &high)
     });
@@ -367,8 +367,8 @@ fn a_fixed_gain_replaces_an_automatic_one_and_keeps_full_resolution() {
     let ap3 = ToneSettings::new(ToneCurve::Ap3);
     let auto = ap3.clone().with_gain(GainChoice::Auto);
     assert!(auto.auto_gain && auto.full_resolution);
-    let own = |settings: ToneSettings| settings.with_gain(GainChoice::C(2.0));
-    assert_eq!(own(auto), ToneSettings { gain_c: 2.0, ..ap3.clone() });
+    let fixed = |settings: ToneSettings| settings.with_gain(GainChoice::C(2.0));
+    assert_eq!(fixed(auto), ToneSettings { gain_c: 2.0, ..ap3.clone() });
     let tone_mapped = ToneSettings { full_resolution: true, ..ap3 };
-    assert_eq!(own(tone_mapped.clone()), ToneSettings { gain_c: 2.0, ..tone_mapped });
+    assert_eq!(fixed(tone_mapped.clone()), ToneSettings { gain_c: 2.0, ..tone_mapped });
 }

@@ -3,14 +3,14 @@
 use std::fs;
 
 use crate::common::command::{refused, run, succeed};
-use crate::common::place::Place;
+use crate::common::workspace::Workspace;
 
 #[test]
 fn runs_of_one_dataset_are_compared_and_runs_of_two_are_refused() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
-    succeed(&place.train("a", "--steps 10"));
-    succeed(&place.train("b", "--steps 40"));
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
+    succeed(&workspace.train("a", "--steps 10"));
+    succeed(&workspace.train("b", "--steps 40"));
     let page = path("page.html");
     let stdout = succeed(&format!("compare {} {} --report {page}", path("a"), path("b")));
     for part in ["PSNR of a, dB", "b gains", "steps: 10 | 40"] {
@@ -22,36 +22,36 @@ fn runs_of_one_dataset_are_compared_and_runs_of_two_are_refused() {
     let json: serde_json::Value = serde_json::from_str(&json).unwrap();
     let psnr = |index: usize| json["runs"][index]["mean"]["psnr"].as_f64().unwrap();
     for (index, name) in ["a", "b"].into_iter().enumerate() {
-        let own = succeed(&format!("eval {} --json", path(name)));
-        let own: serde_json::Value = serde_json::from_str(&own).unwrap();
-        assert!((psnr(index) - own["mean"]["psnr"].as_f64().unwrap()).abs() < 1e-9, "{name}");
+        let scores = succeed(&format!("eval {} --json", path(name)));
+        let scores: serde_json::Value = serde_json::from_str(&scores).unwrap();
+        assert!((psnr(index) - scores["mean"]["psnr"].as_f64().unwrap()).abs() < 1e-9, "{name}");
     }
     // Another size, and another dataset.
-    succeed(&place.train("half", "--steps 2 --downscale 1.5"));
+    succeed(&workspace.train("half", "--steps 2 --downscale 1.5"));
     let other = format!("compare {} {} --report {}", path("a"), path("half"), path("no.html"));
     refused(&other, 2, &["half", "runs of different datasets", "40x30 and 27x20 pixels"]);
-    assert!(!place.path("no.html").exists());
+    assert!(!workspace.path("no.html").exists());
     refused(&format!("compare {}", path("a")), 2, &["<RUNS>"]);
     refused(&format!("compare {} {}", path("a"), path("nowhere")), 3, &["nowhere"]);
 }
 
 #[test]
 fn excluded_photographs_are_left_out_and_the_others_keep_their_split() {
-    let place = Place::new();
-    let set = place.path("set").display().to_string();
-    let train = |name: &str, options: &str| place.train(name, &format!("--steps 1 {options}"));
+    let workspace = Workspace::new();
+    let set = workspace.path("set").display().to_string();
+    let train = |name: &str, options: &str| workspace.train(name, &format!("--steps 1 {options}"));
     succeed(&train("all", ""));
     succeed(&train("less", "--exclude 00[12] --exclude low/003.*"));
-    let names = |run: &str| fs::read_to_string(place.path(run).join("views.csv")).unwrap();
+    let names = |run: &str| fs::read_to_string(workspace.path(run).join("views.csv")).unwrap();
     let gone: Vec<String> = names("all")
         .lines()
         .filter(|line| !names("less").contains(line))
         .map(str::to_owned)
         .collect();
     assert_eq!(gone.len(), 3, "{gone:?}");
-    fs::write(place.path("names.txt"), "# blurred\n001.png\n\n").unwrap();
-    succeed(&train("listed", &format!("--exclude-file {}", place.path("names.txt").display())));
-    let config = fs::read_to_string(place.path("listed/config.toml")).unwrap();
+    fs::write(workspace.path("names.txt"), "# blurred\n001.png\n\n").unwrap();
+    succeed(&train("listed", &format!("--exclude-file {}", workspace.path("names.txt").display())));
+    let config = fs::read_to_string(workspace.path("listed/config.toml")).unwrap();
     assert!(config.contains("exclude = [\"001.png\"]"), "{config}");
     refused(&train("no", "--exclude IMG_*"), 3, &[&set, "`IMG_*`"]);
     refused(&train("no", "--exclude [a"), 2, &["exclude"]);
@@ -60,8 +60,8 @@ fn excluded_photographs_are_left_out_and_the_others_keep_their_split() {
 
 #[test]
 fn a_sweep_over_two_datasets_writes_the_table_that_papers_print() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
     succeed(&format!("synth {} --views 9 --width 32 --height 24", path("other")));
     let sweep = format!(
         "sweep {} {} --out {} --curves ap3,ase --steps 2 --sh-degree 0",
@@ -70,12 +70,15 @@ fn a_sweep_over_two_datasets_writes_the_table_that_papers_print() {
         path("sweep")
     );
     let stdout = succeed(&sweep);
-    let table = fs::read_to_string(place.path("sweep/scenes.md")).unwrap();
+    let table = fs::read_to_string(workspace.path("sweep/scenes.md")).unwrap();
     assert!(stdout.contains("| PSNR / SSIM | set | other | mean |"), "{stdout}");
     assert_eq!(table.lines().count(), 4, "{table}");
-    let csv = fs::read_to_string(place.path("sweep/scenes.csv")).unwrap();
+    let csv = fs::read_to_string(workspace.path("sweep/scenes.csv")).unwrap();
     assert_eq!(csv.lines().count(), 7, "{csv}");
-    assert!(place.path("sweep/set/index.html").exists() && place.path("sweep/scenes.tex").exists());
+    assert!(
+        workspace.path("sweep/set/index.html").exists()
+            && workspace.path("sweep/scenes.tex").exists()
+    );
     // Repeated, it trains nothing again.
     let (_, message) = run(&sweep, 0);
     assert!(!message.contains("finished"), "{message}");

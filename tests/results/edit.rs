@@ -13,7 +13,7 @@ use nightsplat::splats::scene::{Gaussians, ply};
 
 use crate::common::command::{refused, run, succeed};
 use crate::common::largest;
-use crate::common::place::Place;
+use crate::common::workspace::Workspace;
 
 /// A cloud of Gaussians of degree 3 around the origin.
 fn cloud(count: usize, seed: u64) -> Model {
@@ -53,14 +53,14 @@ fn difference(a: &Image, b: &Image) -> f32 {
 
 #[test]
 fn a_model_turned_there_and_back_renders_the_same_and_turned_it_does_from_a_turned_camera() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
     let model = cloud(400, 3);
-    model.save(place.path("model.ply")).unwrap();
+    model.save(workspace.path("model.ply")).unwrap();
     let axis = DVec3::new(1.0, 2.0, -0.5);
     let edit = |options: &str, out: &str| {
         succeed(&format!("edit {} {options} --out {}", path("model.ply"), path(out)));
-        Model::load(place.path(out)).unwrap()
+        Model::load(workspace.path(out)).unwrap()
     };
     let before = render(&model, &camera(DQuat::IDENTITY));
     assert!(largest(&before.data) > 0.3, "nothing is seen");
@@ -93,13 +93,13 @@ fn a_model_turned_there_and_back_renders_the_same_and_turned_it_does_from_a_turn
 
 #[test]
 fn a_crop_keeps_what_is_inside_and_a_merge_puts_both_halves_together() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
     let model = cloud(300, 5);
-    model.save(place.path("model.ply")).unwrap();
+    model.save(workspace.path("model.ply")).unwrap();
     let crop = |region: &str, out: &str| {
         succeed(&format!("edit {} --crop {region} --out {}", path("model.ply"), path(out)));
-        ply::load(place.path(out)).unwrap()
+        ply::load(workspace.path(out)).unwrap()
     };
     let left = crop("-2,-2,-2,0,2,2", "left.ply");
     let right = crop("0,-2,-2,2,2,2", "right.ply");
@@ -122,7 +122,7 @@ fn a_crop_keeps_what_is_inside_and_a_merge_puts_both_halves_together() {
         stdout.contains(&format!("{} Gaussians added to {}", right.count, left.count)),
         "{stdout}"
     );
-    let both = Model::load(place.path("both.ply")).unwrap();
+    let both = Model::load(workspace.path("both.ply")).unwrap();
     let [whole, joined] = [&model, &both].map(|model| render(model, &camera(DQuat::IDENTITY)));
     let error = difference(&whole, &joined);
     assert!(error < 1e-5, "{error}");
@@ -133,17 +133,17 @@ fn a_crop_keeps_what_is_inside_and_a_merge_puts_both_halves_together() {
         path("less.ply")
     );
     succeed(&degree);
-    let less = ply::load(place.path("less.ply")).unwrap();
+    let less = ply::load(workspace.path("less.ply")).unwrap();
     assert_eq!(less.shape.sh_degree, 1);
     assert!(less.count < 200 && less.raw_opacities().iter().all(|raw| *raw >= 0.0));
 }
 
 #[test]
 fn an_edit_list_repeats_an_edit_of_its_model_and_is_refused_for_another() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
-    cloud(200, 7).save(place.path("a.ply")).unwrap();
-    cloud(100, 8).save(place.path("b.ply")).unwrap();
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
+    cloud(200, 7).save(workspace.path("a.ply")).unwrap();
+    cloud(100, 8).save(workspace.path("b.ply")).unwrap();
     let options = "--crop 0,0,0,1.2 --rotate 1,1,0:37 --scale 0,0,0:0,2,0=3 --move 1,0,0 --merge";
     let edit = |options: &str, out: &str| succeed(&format!("edit {options} --out {}", path(out)));
     let first = format!(
@@ -155,14 +155,14 @@ fn an_edit_list_repeats_an_edit_of_its_model_and_is_refused_for_another() {
     edit(&first, "first.ply");
     edit(&first, "again.ply");
     edit(&format!("{} --edits {}", path("a.ply"), path("edits.json")), "listed.ply");
-    assert_eq!(place.read("first.ply"), place.read("again.ply"));
-    assert_eq!(place.read("first.ply"), place.read("listed.ply"));
-    let text = fs::read_to_string(place.path("edits.json")).unwrap();
+    assert_eq!(workspace.read("first.ply"), workspace.read("again.ply"));
+    assert_eq!(workspace.read("first.ply"), workspace.read("listed.ply"));
+    let text = fs::read_to_string(workspace.path("edits.json")).unwrap();
     assert!(text.contains(r#"{"scale":1.5}"#), "{text}");
 
     // The header has the list, and a later edit keeps it.
     edit(&format!("{} --move 0,1,0", path("first.ply")), "later.ply");
-    let later = place.read("later.ply");
+    let later = workspace.read("later.ply");
     let header = String::from_utf8_lossy(&later[..2000]);
     let lists: Vec<&str> =
         header.lines().filter(|line| line.starts_with("comment edits: {")).collect();
@@ -173,19 +173,19 @@ fn an_edit_list_repeats_an_edit_of_its_model_and_is_refused_for_another() {
     let other = format!("edit {} --edits {list} --out {}", path("b.ply"), path("out.ply"));
     refused(&other, 3, &["edits.json", "another model", "b.ply is"]);
     // A merged model that changed since.
-    cloud(100, 9).save(place.path("b.ply")).unwrap();
+    cloud(100, 9).save(workspace.path("b.ply")).unwrap();
     let changed = format!("edit {} --edits {list} --out {}", path("a.ply"), path("out.ply"));
     refused(&changed, 3, &["b.ply", "as the edit list says"]);
-    fs::write(place.path("edits.json"), text.replace("edits\": 1", "edits\": 9")).unwrap();
+    fs::write(workspace.path("edits.json"), text.replace("edits\": 1", "edits\": 9")).unwrap();
     refused(&changed, 3, &["edits.json", "of version 9"]);
-    assert!(!place.path("out.ply").exists());
+    assert!(!workspace.path("out.ply").exists());
 }
 
 #[test]
 fn an_edit_that_leaves_nothing_or_cannot_be_written_says_so_and_writes_nothing() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
-    cloud(20, 7).save(place.path("a.ply")).unwrap();
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
+    cloud(20, 7).save(workspace.path("a.ply")).unwrap();
     let out = path("out.ply");
     let (model, set) = (path("a.ply"), path("set"));
     for (options, code, part) in [
@@ -204,28 +204,28 @@ fn an_edit_that_leaves_nothing_or_cannot_be_written_says_so_and_writes_nothing()
     }
     refused(&format!("edit {model} --move 1,0,0 --out {model}"), 1, &["is the model itself"]);
     refused(&format!("edit {model} --move 1,0,0 --out {out}.txt"), 2, &["name it .ply"]);
-    let mut broken = place.read("a.ply");
+    let mut broken = workspace.read("a.ply");
     let length = broken.len();
     broken[length - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
-    fs::write(place.path("nan.ply"), broken).unwrap();
+    fs::write(workspace.path("nan.ply"), broken).unwrap();
     refused(
         &format!("edit {} --move 1,0,0 --out {out}", path("nan.ply")),
         3,
         &["vertex 19", "NaN"],
     );
-    let left = fs::read_dir(place.path("")).unwrap().count();
+    let left = fs::read_dir(workspace.path("")).unwrap().count();
     // The set and the two models.
     assert_eq!(left, 3);
 }
 
 #[test]
 fn a_table_of_cameras_in_metres_scales_a_model_and_cameras_crop_it_wherever_it_is() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
-    succeed(&place.train("run", "--steps 10"));
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
+    succeed(&workspace.train("run", "--steps 10"));
     let set = path("set");
     // 2.5 metres a unit, in a world of another origin.
-    let listing = fs::read_to_string(place.path("set/transforms_train.json")).unwrap();
+    let listing = fs::read_to_string(workspace.path("set/transforms_train.json")).unwrap();
     let listing: serde_json::Value = serde_json::from_str(&listing).unwrap();
     let row = |frame: &serde_json::Value| {
         let at = |row: usize| 2.5 * frame["transform_matrix"][row][3].as_f64().unwrap() + 100.0;
@@ -233,19 +233,19 @@ fn a_table_of_cameras_in_metres_scales_a_model_and_cameras_crop_it_wherever_it_i
         format!("{name},{},{},{}\n", at(0), at(1), at(2))
     };
     let table: String = listing["frames"].as_array().unwrap().iter().map(row).collect();
-    fs::write(place.path("metres.csv"), format!("name,x,y,z\n{table}")).unwrap();
+    fs::write(workspace.path("metres.csv"), format!("name,x,y,z\n{table}")).unwrap();
     let edit = |options: &str, out: &str| {
         run(&format!("edit {} {options} --out {}", path("run"), path(out)), 0)
     };
     let (stdout, _) = edit(&format!("--scale {}", path("metres.csv")), "metres.ply");
-    let own = ply::load(place.path("run/model.ply")).unwrap();
-    let metres = ply::load(place.path("metres.ply")).unwrap();
-    for (own, metres) in own.means().iter().zip(metres.means()) {
-        assert!((*own * 2.5).distance(*metres) < 1e-4, "{stdout}: {own} {metres}");
+    let trained = ply::load(workspace.path("run/model.ply")).unwrap();
+    let metres = ply::load(workspace.path("metres.ply")).unwrap();
+    for (mean, metres) in trained.means().iter().zip(metres.means()) {
+        assert!((*mean * 2.5).distance(*metres) < 1e-4, "{stdout}: {mean} {metres}");
     }
     // Distances of the table are those of the dataset, whatever the model was scaled by before.
     edit(&format!("--scale 7 --scale {}", path("metres.csv")), "again.ply");
-    let again = ply::load(place.path("again.ply")).unwrap();
+    let again = ply::load(workspace.path("again.ply")).unwrap();
     for (again, metres) in again.means().iter().zip(metres.means()) {
         assert!(again.distance(*metres) < 1e-4, "{again} {metres}");
     }
@@ -254,46 +254,50 @@ fn a_table_of_cameras_in_metres_scales_a_model_and_cameras_crop_it_wherever_it_i
     edit("--crop cameras", "cropped.ply");
     edit(&format!("{transform} --crop cameras"), "moved.ply");
     let [cropped, moved] =
-        ["cropped.ply", "moved.ply"].map(|name| ply::load(place.path(name)).unwrap());
-    assert!(cropped.count > 0 && cropped.count <= own.count);
+        ["cropped.ply", "moved.ply"].map(|name| ply::load(workspace.path(name)).unwrap());
+    assert!(cropped.count > 0 && cropped.count <= trained.count);
     assert_eq!(cropped.count, moved.count, "{set}");
 }
 
 #[test]
 fn the_gaussians_that_contribute_most_to_the_photographs_are_kept() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
-    succeed(&place.train("run", "--steps 40"));
-    let own = ply::load(place.path("run/model.ply")).unwrap();
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
+    succeed(&workspace.train("run", "--steps 40"));
+    let trained = ply::load(workspace.path("run/model.ply")).unwrap();
     // As many again: half of them outside all views, half as transparent as 8 bits do not show.
-    let mut unseen = own.clone();
+    let mut unseen = trained.clone();
     unseen.means_mut().iter_mut().for_each(|mean| *mean += Vec3::new(0.0, 500.0, 0.0));
-    let half = own.count / 2;
+    let half = trained.count / 2;
     for index in 0..half {
-        unseen.means_mut()[index] = own.means()[index];
+        unseen.means_mut()[index] = trained.means()[index];
         unseen.raw_opacities_mut()[index] = -7.0;
     }
-    ply::save(&unseen, place.path("unseen.ply")).unwrap();
+    ply::save(&unseen, workspace.path("unseen.ply")).unwrap();
     let merge = format!("edit {} --merge {}", path("run"), path("unseen.ply"));
     let stdout =
-        succeed(&format!("{merge} --max-gaussians {} --out {}", own.count, path("kept.ply")));
-    assert!(stdout.contains(&format!("max-gaussians {0}: {0} of", own.count)), "{stdout}");
-    let kept = ply::load(place.path("kept.ply")).unwrap();
+        succeed(&format!("{merge} --max-gaussians {} --out {}", trained.count, path("kept.ply")));
+    assert!(stdout.contains(&format!("max-gaussians {0}: {0} of", trained.count)), "{stdout}");
+    let kept = ply::load(workspace.path("kept.ply")).unwrap();
     // Of the run's own, only those that no view sees may make room.
-    let is_own = |mean: &&Vec3| own.means().contains(mean) && mean.y < 250.0;
+    let is_own = |mean: &&Vec3| trained.means().contains(mean) && mean.y < 250.0;
     let stayed = kept.means().iter().filter(is_own).count();
-    assert!(kept.count == own.count && stayed * 100 >= own.count * 95, "{stayed} of {}", own.count);
+    assert!(
+        kept.count == trained.count && stayed * 100 >= trained.count * 95,
+        "{stayed} of {}",
+        trained.count
+    );
 
-    let most = own.count * 2 / 3;
+    let most = trained.count * 2 / 3;
     let edit = format!("edit {} --max-gaussians {most} --out {}", path("run"), path("most.ply"));
     succeed(&edit);
-    let first = place.read("most.ply");
+    let first = workspace.read("most.ply");
     succeed(&edit);
-    assert!(first == place.read("most.ply"), "the same command gave other bytes");
+    assert!(first == workspace.read("most.ply"), "the same command gave other bytes");
     let all = succeed(&format!(
         "edit {} --max-gaussians {} --out {}",
         path("run"),
-        own.count + 5,
+        trained.count + 5,
         path("all.ply")
     ));
     assert!(!all.contains("removed"), "{all}");

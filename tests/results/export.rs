@@ -73,7 +73,7 @@ fn positions_of_glb(path: &Path) -> Vec<[f32; 3]> {
     let begin = 28 + text + view["byteOffset"].as_u64().unwrap_or(0) as usize;
     let count = accessor["count"].as_u64().unwrap() as usize;
     let number = |at: usize| f32::from_le_bytes(file[at..at + 4].try_into().unwrap());
-    (0..count).map(|own| [0, 4, 8].map(|at| number(begin + 12 * own + at))).collect()
+    (0..count).map(|index| [0, 4, 8].map(|at| number(begin + 12 * index + at))).collect()
 }
 
 #[test]

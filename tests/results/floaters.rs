@@ -8,7 +8,7 @@ use nightsplat::base::random::Stream;
 use nightsplat::splats::scene::{Gaussians, ply};
 
 use crate::common::command::succeed;
-use crate::common::place::Place;
+use crate::common::workspace::Workspace;
 
 /// Gaussians at random places of random views of a listing, before what they show.
 fn floaters(listing: &str, count: usize) -> Gaussians {
@@ -47,44 +47,44 @@ fn floaters(listing: &str, count: usize) -> Gaussians {
 
 #[test]
 fn planted_floaters_are_removed_and_a_clean_model_keeps_its_gaussians() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
-    succeed(&place.train("run", "--steps 400"));
-    let clean = ply::load(place.path("run/model.ply")).unwrap();
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
+    succeed(&workspace.train("run", "--steps 400"));
+    let clean = ply::load(workspace.path("run/model.ply")).unwrap();
 
     let stdout = succeed(&format!("edit {} --floaters --out {}", path("run"), path("clean.ply")));
-    let kept = ply::load(place.path("clean.ply")).unwrap();
+    let kept = ply::load(workspace.path("clean.ply")).unwrap();
     assert!(kept.count * 100 >= clean.count * 99, "{stdout}");
     let psnr = |stdout: &str, after: &str| -> f64 {
         let (before, _) = stdout.split_once(after).unwrap();
         before.split([' ', '(']).rfind(|word| word.parse::<f64>().is_ok()).unwrap().parse().unwrap()
     };
-    let own = psnr(&stdout, " dB before");
+    let psnr_before = psnr(&stdout, " dB before");
 
     // The same run with floaters in its model.
-    let listing = fs::read_to_string(place.path("set/transforms_train.json")).unwrap();
+    let listing = fs::read_to_string(workspace.path("set/transforms_train.json")).unwrap();
     let planted = floaters(&listing, 100);
-    ply::save(&planted, place.path("planted.ply")).unwrap();
+    ply::save(&planted, workspace.path("planted.ply")).unwrap();
     succeed(&format!(
         "edit {} --merge {} --out {}",
         path("run"),
         path("planted.ply"),
         path("both.ply")
     ));
-    fs::copy(place.path("both.ply"), place.path("run/model.ply")).unwrap();
+    fs::copy(workspace.path("both.ply"), workspace.path("run/model.ply")).unwrap();
     let stdout = succeed(&format!("edit {} --floaters --out {}", path("run"), path("found.ply")));
-    let found = ply::load(place.path("found.ply")).unwrap();
+    let found = ply::load(workspace.path("found.ply")).unwrap();
     let place_of = |mean: &Vec3| mean.to_array().map(f32::to_bits);
     let left: BTreeSet<[u32; 3]> = found.means().iter().map(place_of).collect();
     let missed = planted.means().iter().filter(|mean| left.contains(&place_of(mean))).count();
     assert!(missed <= 5, "{missed} of 100: {stdout}");
     assert!(found.count * 100 >= clean.count * 99, "{stdout}");
     let (with, without) = (psnr(&stdout, " dB before"), psnr(&stdout, " dB after"));
-    assert!(with < own - 1.0 && without >= own - 0.02, "{own}: {stdout}");
+    assert!(with < psnr_before - 1.0 && without >= psnr_before - 0.02, "{psnr_before}: {stdout}");
 
     // Wherever the model is.
     let moved = "--rotate 1,2,3:40 --scale 3 --move 5,0,0 --floaters";
     let stdout = succeed(&format!("edit {} {moved} --out {}", path("run"), path("moved.ply")));
-    let moved = ply::load(place.path("moved.ply")).unwrap();
+    let moved = ply::load(workspace.path("moved.ply")).unwrap();
     assert!(moved.count.abs_diff(found.count) <= 2, "{stdout}");
 }

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use nightsplat::gpu::testing::gpu;
 
 use crate::common::command::{command, refused_with, run, succeed};
-use crate::common::place::Place;
+use crate::common::workspace::Workspace;
 
 /// A running command in its own process group, as a shell would start it.
 fn begun(arguments: &str) -> Child {
@@ -36,36 +36,36 @@ fn ended(child: Child) -> (i32, String) {
 
 #[test]
 fn a_lost_device_and_a_lack_of_memory_exit_with_4_and_the_run_can_be_resumed() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let options = "--steps 40 --checkpoint-every 10";
-    succeed(&place.train("straight", options));
+    succeed(&workspace.train("straight", options));
     for (fault, message) in
         [("submission:60", "was lost while"), ("allocation:100", "out of device memory")]
     {
         let name = fault.replace(':', "-");
-        let train = place.train(&name, &format!("{options} --progress none"));
+        let train = workspace.train(&name, &format!("{options} --progress none"));
         let output = command(&train).env("NIGHTSPLAT_FAULT", fault).output().unwrap();
         let stderr = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(4), "{fault}: {stderr}");
         assert!(stderr.lines().last().is_some_and(|line| line.contains(message)), "{stderr}");
-        assert!(!place.path(&name).join("done.json").exists());
-        succeed(&place.train(&name, &format!("{options} --resume")));
-        assert!(place.model(&name) == place.model("straight"), "{fault}");
+        assert!(!workspace.path(&name).join("done.json").exists());
+        succeed(&workspace.train(&name, &format!("{options} --resume")));
+        assert!(workspace.model(&name) == workspace.model("straight"), "{fault}");
     }
     let nonsense = [("NIGHTSPLAT_FAULT", "flood:1")];
-    refused_with(&place.train("new", options), &nonsense, 2, &["NIGHTSPLAT_FAULT=flood:1"]);
+    refused_with(&workspace.train("new", options), &nonsense, 2, &["NIGHTSPLAT_FAULT=flood:1"]);
 }
 
 #[test]
 fn a_full_disk_is_reported_and_existing_files_stay_intact() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     // Runs of other lengths start equally if none converges before its end.
     let options = "--steps 40 --checkpoint-every 10 --set schedule.cooldown_steps=0";
-    succeed(&place.train("run", &options.replace("40", "10")));
-    let before = place.model("run");
+    succeed(&workspace.train("run", &options.replace("40", "10")));
+    let before = workspace.model("run");
     // Limits the size of files, as on a full disk; the checkpoint needs more.
     let program = command("").get_program().to_str().unwrap().to_owned();
-    let train = place.train("run", &format!("{options} --resume --progress none"));
+    let train = workspace.train("run", &format!("{options} --resume --progress none"));
     let line = format!("trap '' XFSZ; ulimit -f 40; exec {program} {train}");
     let output =
         Command::new("sh").args(["-c", &line]).env("NIGHTSPLAT_TUNE", "off").output().unwrap();
@@ -73,23 +73,23 @@ fn a_full_disk_is_reported_and_existing_files_stay_intact() {
     assert_eq!(output.status.code(), Some(1), "{stderr}");
     assert!(stderr.contains("cannot be written") && stderr.contains("disk"), "{stderr}");
     let is_half = |name: &str| name.ends_with(".partial") || name.starts_with(".tmp");
-    let files: Vec<_> = fs::read_dir(place.path("run")).unwrap().flatten().collect();
+    let files: Vec<_> = fs::read_dir(workspace.path("run")).unwrap().flatten().collect();
     let names = files.iter().map(|file| file.file_name().to_string_lossy().into_owned());
     assert!(!names.into_iter().any(|name| is_half(&name)), "{files:?}");
-    if let Ok(model) = fs::read(place.path("run/model.ply")) {
+    if let Ok(model) = fs::read(workspace.path("run/model.ply")) {
         assert!(model == before, "half a model");
     }
-    succeed(&place.train("run", &format!("{options} --resume")));
-    succeed(&place.train("straight", options));
-    assert!(place.model("run") == place.model("straight"));
+    succeed(&workspace.train("run", &format!("{options} --resume")));
+    succeed(&workspace.train("straight", options));
+    assert!(workspace.model("run") == workspace.model("straight"));
 }
 
 #[test]
 fn an_unwritable_directory_is_refused_before_training() {
-    let place = Place::new();
-    let read_only = place
+    let workspace = Workspace::new();
+    let read_only = workspace
         .train("run", "--steps 1")
-        .replace(&place.path("run").display().to_string(), "/proc/nightsplat");
+        .replace(&workspace.path("run").display().to_string(), "/proc/nightsplat");
     let begin = Instant::now();
     let (_, stderr) = run(&read_only, 1);
     assert!(stderr.contains("/proc/nightsplat"), "{stderr}");
@@ -98,44 +98,44 @@ fn an_unwritable_directory_is_refused_before_training() {
 
 #[test]
 fn a_deleted_run_folder_is_reported_and_a_run_without_its_photographs_is_saved() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let endless = "--steps 1000000 --checkpoint-every 0 --progress json";
-    let mut child = begun(&place.train("gone", endless));
+    let mut child = begun(&workspace.train("gone", endless));
     wait_for_start(&mut child);
-    fs::remove_dir_all(place.path("gone")).unwrap();
+    fs::remove_dir_all(workspace.path("gone")).unwrap();
     terminate(&child);
     let (code, stderr) = ended(child);
     assert!(code == 1 && stderr.contains("gone"), "{code}: {stderr}");
 
     // An empty cache: every photograph is on disk, as at the start of the run.
     let options = "--steps 300 --cache 1K --checkpoint-every 0";
-    succeed(&place.train("straight", options));
-    let mut child = begun(&place.train("run", &format!("{options} --progress json")));
+    succeed(&workspace.train("straight", options));
+    let mut child = begun(&workspace.train("run", &format!("{options} --progress json")));
     wait_for_start(&mut child);
-    fs::rename(place.path("set"), place.path("elsewhere")).unwrap();
+    fs::rename(workspace.path("set"), workspace.path("elsewhere")).unwrap();
     let _ = child.stdout.take();
     let (code, stderr) = ended(child);
     if code != 0 {
         assert!(code == 3 && stderr.contains("set"), "{code}: {stderr}");
-        assert!(place.path("run/checkpoint.safetensors").exists(), "{stderr}");
-        fs::rename(place.path("elsewhere"), place.path("set")).unwrap();
-        succeed(&place.train("run", &format!("{options} --resume")));
+        assert!(workspace.path("run/checkpoint.safetensors").exists(), "{stderr}");
+        fs::rename(workspace.path("elsewhere"), workspace.path("set")).unwrap();
+        succeed(&workspace.train("run", &format!("{options} --resume")));
     }
-    assert!(place.model("run") == place.model("straight"));
+    assert!(workspace.model("run") == workspace.model("straight"));
 }
 
 #[test]
 fn a_terminated_batch_saves_its_runs_and_resumes_to_the_same_leaderboard() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     // A GPU must not be done before the log of its first steps is seen, which is written twice a second.
     let steps = if gpu().properties().is_cpu { 400 } else { 10_000 };
     let sweep = |name: &str| {
-        let (set, out) = (place.path("set"), place.path(name));
+        let (set, out) = (workspace.path("set"), workspace.path(name));
         let (set, out) = (set.display(), out.display());
         format!("sweep {set} --out {out} --curves linear,ase --steps {steps} --sh-degree 1")
     };
     let child = begun(&sweep("sweep"));
-    let first = place.path("sweep/curve=linear/train.csv");
+    let first = workspace.path("sweep/curve=linear/train.csv");
     let begin = Instant::now();
     while fs::read_to_string(&first).map_or(0, |log| log.lines().count()) < 3 {
         assert!(begin.elapsed() < Duration::from_secs(120));
@@ -145,10 +145,10 @@ fn a_terminated_batch_saves_its_runs_and_resumes_to_the_same_leaderboard() {
     let (code, stderr) = ended(child);
     assert_eq!(code, 143, "{stderr}");
     assert!(stderr.contains("terminated with 0 of 2 runs done"), "{stderr}");
-    assert!(place.path("sweep/curve=linear/checkpoint.safetensors").exists());
-    assert!(!place.path("sweep/curve=ase/config.toml").exists());
+    assert!(workspace.path("sweep/curve=linear/checkpoint.safetensors").exists());
+    assert!(!workspace.path("sweep/curve=ase/config.toml").exists());
     succeed(&sweep("sweep"));
     succeed(&sweep("straight"));
-    let leaderboard = |name: &str| fs::read(place.path(name).join("leaderboard.csv")).unwrap();
+    let leaderboard = |name: &str| fs::read(workspace.path(name).join("leaderboard.csv")).unwrap();
     assert!(leaderboard("sweep") == leaderboard("straight"));
 }

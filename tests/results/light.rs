@@ -6,23 +6,23 @@ use nightsplat::splats::scene::ply;
 use serde_json::Value;
 
 use crate::common::command::{refused, run, succeed};
-use crate::common::place::Place;
+use crate::common::workspace::Workspace;
 
 fn json(arguments: &str) -> Value {
     serde_json::from_str(&succeed(arguments)).unwrap()
 }
 
 /// The arguments for training with the default curve into `run`.
-fn training(place: &Place, options: &str) -> String {
-    let (set, out) = (place.path("set").display().to_string(), place.path("run"));
+fn training(workspace: &Workspace, options: &str) -> String {
+    let (set, out) = (workspace.path("set").display().to_string(), workspace.path("run"));
     format!("train {set} --out {} --sh-degree 1 --plan none {options}", out.display())
 }
 
 #[test]
 fn renders_are_written_and_scored_in_the_light_of_the_photographs() {
-    let place = Place::new();
-    succeed(&training(&place, "--steps 60 --set antialiasing.compensation=true"));
-    let at = |name: &str| place.path(name).display().to_string();
+    let workspace = Workspace::new();
+    succeed(&training(&workspace, "--steps 60 --set antialiasing.compensation=true"));
+    let at = |name: &str| workspace.path(name).display().to_string();
     let run_at = at("run");
 
     let scored = json(&format!("eval {run_at} --photographs --align --json"));
@@ -65,24 +65,24 @@ fn renders_are_written_and_scored_in_the_light_of_the_photographs() {
 
 #[test]
 fn a_model_in_linear_light_states_it_and_has_other_colours() {
-    let place = Place::new();
-    succeed(&training(&place, "--steps 40 --antialiasing on"));
-    let at = |name: &str| place.path(name).display().to_string();
+    let workspace = Workspace::new();
+    succeed(&training(&workspace, "--steps 40 --antialiasing on"));
+    let at = |name: &str| workspace.path(name).display().to_string();
     let export = |format: &str, out: &str| {
         format!("export {} --linear --format {format} --out {}", at("run"), at(out))
     };
     succeed(&export("ply", "linear.ply"));
-    let [own, linear] =
-        ["run/model.ply", "linear.ply"].map(|name| ply::load(place.path(name)).unwrap());
-    assert_eq!(own.means(), linear.means());
-    assert_eq!(own.raw_opacities(), linear.raw_opacities());
-    assert!(own.dc() != linear.dc() && linear.dc().iter().all(|dc| dc.is_finite()));
-    let header = String::from_utf8_lossy(&place.read("linear.ply")[..2000]).into_owned();
+    let [encoded, linear] =
+        ["run/model.ply", "linear.ply"].map(|name| ply::load(workspace.path(name)).unwrap());
+    assert_eq!(encoded.means(), linear.means());
+    assert_eq!(encoded.raw_opacities(), linear.raw_opacities());
+    assert!(encoded.dc() != linear.dc() && linear.dc().iter().all(|dc| dc.is_finite()));
+    let header = String::from_utf8_lossy(&workspace.read("linear.ply")[..2000]).into_owned();
     for fact in ["nightsplat linear ", "nightsplat antialiased true"] {
         assert!(header.contains(fact), "{header}");
     }
     succeed(&export("glb", "linear.glb"));
-    let text = String::from_utf8_lossy(&place.read("linear.glb")).into_owned();
+    let text = String::from_utf8_lossy(&workspace.read("linear.glb")).into_owned();
     assert!(text.contains("lin_rec709_display"));
     refused(&export("spz", "linear.spz"), 2, &["--linear needs floats", "ply or glb"]);
     let of_file = format!("export {} --linear --format glb", at("linear.ply"));
@@ -93,13 +93,13 @@ fn a_model_in_linear_light_states_it_and_has_other_colours() {
 
 #[test]
 fn a_trained_model_states_the_law_whose_inverse_is_the_linear_light() {
-    let place = Place::new();
-    succeed(&training(&place, "--steps 40"));
-    let at = |name: &str| place.path(name).display().to_string();
+    let workspace = Workspace::new();
+    succeed(&training(&workspace, "--steps 40"));
+    let at = |name: &str| workspace.path(name).display().to_string();
     let export =
         |options: &str, out: &str| format!("export {} {options} --out {}", at("run"), at(out));
     succeed(&export("--format ply --linear", "linear.ply"));
-    let header = String::from_utf8_lossy(&place.read("linear.ply")[..2000]).into_owned();
+    let header = String::from_utf8_lossy(&workspace.read("linear.ply")[..2000]).into_owned();
     let stated = header.lines().find_map(|line| line.strip_prefix("comment nightsplat linear "));
     let stops: f32 = stated.unwrap().parse().unwrap();
     for format in ["ply", "spz", "sog"] {
@@ -107,10 +107,10 @@ fn a_trained_model_states_the_law_whose_inverse_is_the_linear_light() {
         succeed(&export(&format!("--format {format}"), &out));
     }
     for model in ["run/model.ply", "run", "law.ply", "law.spz", "law.sog"] {
-        let law = Model::load(place.path(model)).unwrap().law.expect(model);
+        let law = Model::load(workspace.path(model)).unwrap().law.expect(model);
         assert!((law.stops() - stops).abs() < 1e-4, "{model}: {law:?}, {stops}");
     }
-    assert_eq!(Model::load(place.path("linear.ply")).unwrap().law, None);
+    assert_eq!(Model::load(workspace.path("linear.ply")).unwrap().law, None);
     // Colours of another law are not made of these photographs.
     let other = format!("--out {} --curve ase --steps 40", at("other"));
     succeed(&format!("train {} --sh-degree 1 --plan none {other}", at("set")));
@@ -120,14 +120,14 @@ fn a_trained_model_states_the_law_whose_inverse_is_the_linear_light() {
     };
     succeed(&merge("law.ply", "both.ply"));
     succeed(&merge("other/model.ply", "mixed.ply"));
-    assert!(Model::load(place.path("both.ply")).unwrap().law.is_some());
-    assert_eq!(Model::load(place.path("mixed.ply")).unwrap().law, None);
+    assert!(Model::load(workspace.path("both.ply")).unwrap().law.is_some());
+    assert_eq!(Model::load(workspace.path("mixed.ply")).unwrap().law, None);
 }
 
 #[test]
 fn a_set_of_varying_exposure_has_its_clean_references_and_the_same_bytes_for_a_seed() {
-    let place = Place::new();
-    let at = |name: &str| place.path(name).display().to_string();
+    let workspace = Workspace::new();
+    let at = |name: &str| workspace.path(name).display().to_string();
     // The set has dark photographs and, in `high`, those in normal light.
     let vary = |out: &str, options: &str| {
         run(&format!("vary {} --out {} --gamma 0.8,1.25 {options}", at("set"), at(out)), 0).1
@@ -137,11 +137,11 @@ fn a_set_of_varying_exposure_has_its_clean_references_and_the_same_bytes_for_a_s
     vary("c", "--seed 4");
     let bytes = |set: &str| {
         ["low/001.png", "images/001.png", "varied.csv", "test.txt", "sparse/0/points3D.txt"]
-            .map(|file| place.read(&format!("{set}/{file}")))
+            .map(|file| workspace.read(&format!("{set}/{file}")))
     };
     assert!(bytes("a") == bytes("b") && bytes("a") != bytes("c"));
-    let [varied, clean] =
-        ["a/low/001.png", "a/images/001.png"].map(|file| Image::load(place.path(file)).unwrap());
+    let [varied, clean] = ["a/low/001.png", "a/images/001.png"]
+        .map(|file| Image::load(workspace.path(file)).unwrap());
     assert_ne!(varied.data, clean.data);
     let out = format!("train {} --out {} --steps 5 --plan none", at("a"), at("run"));
     succeed(&out);
@@ -151,7 +151,7 @@ fn a_set_of_varying_exposure_has_its_clean_references_and_the_same_bytes_for_a_s
     // Told that test view 000 is two stops brighter than the others, the render is, too.
     let known: String =
         (0..9).map(|i| format!("{i:03},{}\n", if i == 0 { 2 } else { 0 })).collect();
-    std::fs::write(place.path("a/exposures.csv"), format!("name,ev\n{known}")).unwrap();
+    std::fs::write(workspace.path("a/exposures.csv"), format!("name,ev\n{known}")).unwrap();
     let told = json(&format!("eval {} --json", at("run")));
     let psnr = |scores: &Value, view: &str| scores["views"][view]["psnr"].as_f64().unwrap();
     assert_ne!(psnr(&told["at_own_exposure"], "000"), psnr(&told, "000"));
@@ -164,8 +164,8 @@ fn a_set_of_varying_exposure_has_its_clean_references_and_the_same_bytes_for_a_s
 
 #[test]
 fn varied_exposures_of_a_dark_set_are_warned_of() {
-    let place = Place::new();
-    let (set, out) = (place.path("set"), place.path("out"));
+    let workspace = Workspace::new();
+    let (set, out) = (workspace.path("set"), workspace.path("out"));
     for photograph in std::fs::read_dir(set.join("low")).unwrap() {
         let photograph = photograph.unwrap();
         std::fs::copy(photograph.path(), set.join("high").join(photograph.file_name())).unwrap();

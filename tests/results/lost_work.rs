@@ -8,7 +8,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
 use crate::common::command::{command, refused, run, succeed};
-use crate::common::place::{Place, log};
+use crate::common::workspace::{Workspace, log};
 
 /// A training that has started and has thousands of steps to go.
 fn begun(arguments: &str) -> Child {
@@ -44,48 +44,51 @@ fn wait_for(path: &Path) {
 
 #[test]
 fn a_signal_saves_and_stops_and_the_run_resumes_to_the_same_bits() {
-    let place = Place::new();
-    succeed(&place.train("straight", "--steps 400"));
+    let workspace = Workspace::new();
+    succeed(&workspace.train("straight", "--steps 400"));
     for (signal, code, message) in [("-INT", 130, "interrupted"), ("-TERM", 143, "terminated")] {
         let name = format!("stopped{signal}");
-        let mut child = begun(&place.train(&name, "--steps 400"));
+        let mut child = begun(&workspace.train(&name, "--steps 400"));
         send(signal, &child);
         let _ = child.stdout.take();
         let (status, stderr) = ended(child);
         assert_eq!(status, code, "{stderr}");
         assert!(stderr.contains(message) && stderr.contains("--resume"), "{stderr}");
         assert!(
-            !place.path(&name).join("metrics.json").exists(),
+            !workspace.path(&name).join("metrics.json").exists(),
             "the run ended before the signal"
         );
-        assert!(!place.path(&name).join(".lock").exists());
-        succeed(&place.train(&name, "--steps 400 --resume"));
-        assert!(place.read(&format!("{name}/model.ply")) == place.read("straight/model.ply"));
-        assert_eq!(log(&place.path(&name)), log(&place.path("straight")));
+        assert!(!workspace.path(&name).join(".lock").exists());
+        succeed(&workspace.train(&name, "--steps 400 --resume"));
+        assert!(
+            workspace.read(&format!("{name}/model.ply")) == workspace.read("straight/model.ply")
+        );
+        assert_eq!(log(&workspace.path(&name)), log(&workspace.path("straight")));
     }
 }
 
 #[test]
 fn a_run_saves_on_request_and_when_its_checkpoint_is_old_and_continues() {
-    let place = Place::new();
-    let child =
-        begun(&place.train("asked", "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0"));
-    let checkpoint = place.path("asked/checkpoint.safetensors");
+    let workspace = Workspace::new();
+    let child = begun(
+        &workspace.train("asked", "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0"),
+    );
+    let checkpoint = workspace.path("asked/checkpoint.safetensors");
     assert!(!checkpoint.exists());
     send("-USR1", &child);
     wait_for(&checkpoint);
     // A second run in the directory is refused, and the process of the first named.
     let holder = format!("process {}", child.id());
     for held in ["", "--resume", "--overwrite"] {
-        refused(&place.train("asked", held), 1, &["asked", &holder]);
+        refused(&workspace.train("asked", held), 1, &["asked", &holder]);
     }
     send("-KILL", &child);
     ended(child);
 
     let child = begun(
-        &place.train("old", "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0.01"),
+        &workspace.train("old", "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0.01"),
     );
-    wait_for(&place.path("old/checkpoint.before.safetensors"));
+    wait_for(&workspace.path("old/checkpoint.before.safetensors"));
     send("-INT", &child);
     send("-INT", &child);
     let (code, stderr) = ended(child);
@@ -94,11 +97,11 @@ fn a_run_saves_on_request_and_when_its_checkpoint_is_old_and_continues() {
 
 #[test]
 fn a_run_whose_time_is_up_asks_to_be_repeated_and_a_finished_one_does_not() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     // The time is checked when the ledger is written: on any fast device, that is before the last step. A slow device
     // checks more often.
     let stops = "--resume --hash-every 40 --max-minutes 0.000001";
-    let train = place.train("run", &format!("--steps 120 {stops}"));
+    let train = workspace.train("run", &format!("--steps 120 {stops}"));
     let mut rounds = 0;
     loop {
         let output = command(&train).output().unwrap();
@@ -109,95 +112,100 @@ fn a_run_whose_time_is_up_asks_to_be_repeated_and_a_finished_one_does_not() {
                 break;
             }
         }
-        assert!(!place.path("run/done.json").exists() && rounds < 300);
+        assert!(!workspace.path("run/done.json").exists() && rounds < 300);
     }
     assert!(rounds >= 2, "{rounds}");
-    succeed(&place.train("straight", "--steps 120"));
-    assert!(place.read("run/model.ply") == place.read("straight/model.ply"));
+    succeed(&workspace.train("straight", "--steps 120"));
+    assert!(workspace.read("run/model.ply") == workspace.read("straight/model.ply"));
     // Repeated: nothing is done, and no file changes.
-    let modified = || fs::metadata(place.path("run/model.ply")).unwrap().modified().unwrap();
+    let modified = || fs::metadata(workspace.path("run/model.ply")).unwrap().modified().unwrap();
     let before = modified();
     assert!(succeed(&train).contains("is done"));
     assert_eq!(modified(), before);
-    succeed(&place.train("run", "--steps 130 --resume"));
+    succeed(&workspace.train("run", "--steps 130 --resume"));
     assert!(modified() > before, "a longer run is another");
 }
 
 #[test]
 fn a_finished_run_is_kept_until_its_replacement_has_done_a_step() {
-    let place = Place::new();
-    succeed(&place.train("run", "--steps 3"));
-    let before = place.read("run/model.ply");
+    let workspace = Workspace::new();
+    succeed(&workspace.train("run", "--steps 3"));
+    let before = workspace.read("run/model.ply");
     // A network too large for any device: the run fails after all earlier checks.
     let hopeless = "--overwrite --steps 3 --parts denoiser --denoiser-channels 16384";
-    let output = command(&place.train("run", hopeless)).output().unwrap();
+    let output = command(&workspace.train("run", hopeless)).output().unwrap();
     assert_ne!(output.status.code(), Some(0));
-    assert!(place.read("run/model.ply") == before && !place.path("run/.replaced").exists());
+    assert!(workspace.read("run/model.ply") == before && !workspace.path("run/.replaced").exists());
     // Killed before the first step: the next start restores it.
-    fs::create_dir(place.path("run/.replaced")).unwrap();
+    fs::create_dir(workspace.path("run/.replaced")).unwrap();
     for name in ["model.ply", "config.toml", "metrics.json", "train.csv"] {
-        fs::rename(place.path("run").join(name), place.path("run/.replaced").join(name)).unwrap();
+        fs::rename(workspace.path("run").join(name), workspace.path("run/.replaced").join(name))
+            .unwrap();
     }
-    fs::write(place.path("run/.tmpA1b2C3"), "half a checkpoint").unwrap();
-    fs::write(place.path("run/config.toml"), place.read("run/.replaced/config.toml")).unwrap();
+    fs::write(workspace.path("run/.tmpA1b2C3"), "half a checkpoint").unwrap();
+    fs::write(workspace.path("run/config.toml"), workspace.read("run/.replaced/config.toml"))
+        .unwrap();
     refused(
-        &place.train("run", "--steps 3 --resume"),
+        &workspace.train("run", "--steps 3 --resume"),
         1,
         &["already contains a run", "--overwrite"],
     );
-    assert!(place.read("run/model.ply") == before && !place.path("run/.tmpA1b2C3").exists());
-    succeed(&place.train("run", "--steps 4 --overwrite"));
-    assert!(place.read("run/model.ply") != before && !place.path("run/.replaced").exists());
+    assert!(
+        workspace.read("run/model.ply") == before && !workspace.path("run/.tmpA1b2C3").exists()
+    );
+    succeed(&workspace.train("run", "--steps 4 --overwrite"));
+    assert!(workspace.read("run/model.ply") != before && !workspace.path("run/.replaced").exists());
 }
 
 #[test]
 fn foreign_files_are_neither_replaced_nor_resumed() {
-    let place = Place::new();
-    fs::create_dir(place.path("theirs")).unwrap();
+    let workspace = Workspace::new();
+    fs::create_dir(workspace.path("theirs")).unwrap();
     for (file, content) in [("config.toml", "title = \"my app\"\n"), ("train.csv", "a,b\n")] {
-        fs::write(place.path("theirs").join(file), content).unwrap();
+        fs::write(workspace.path("theirs").join(file), content).unwrap();
         for held in ["--resume", "--overwrite"] {
-            refused(&place.train("theirs", held), 1, &["theirs", "no config.toml"]);
+            refused(&workspace.train("theirs", held), 1, &["theirs", "no config.toml"]);
         }
     }
-    assert_eq!(place.read("theirs/config.toml"), b"title = \"my app\"\n");
-    assert_eq!(place.read("theirs/train.csv"), b"a,b\n");
+    assert_eq!(workspace.read("theirs/config.toml"), b"title = \"my app\"\n");
+    assert_eq!(workspace.read("theirs/train.csv"), b"a,b\n");
 }
 
 #[test]
 fn a_damaged_checkpoint_is_reported_and_the_previous_one_resumes_to_the_same_bits() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let options = "--steps 50 --checkpoint-every 20";
-    succeed(&place.train("run", options));
-    let expected = place.read("run/model.ply");
-    let checkpoint = place.path("run/checkpoint.safetensors");
+    succeed(&workspace.train("run", options));
+    let expected = workspace.read("run/model.ply");
+    let checkpoint = workspace.path("run/checkpoint.safetensors");
     let whole = fs::read(&checkpoint).unwrap();
-    fs::remove_file(place.path("run/done.json")).unwrap();
+    fs::remove_file(workspace.path("run/done.json")).unwrap();
     // A bit of a value, which no format detects.
     let mut flipped = whole.clone();
     let at = flipped.len() - 9;
     flipped[at] ^= 1;
     for damaged in [&flipped[..], &whole[..whole.len() - 7], b""] {
         fs::write(&checkpoint, damaged).unwrap();
-        let (_, stderr) = run(&place.train("run", &format!("{options} --resume")), 0);
+        let (_, stderr) = run(&workspace.train("run", &format!("{options} --resume")), 0);
         assert!(
             stderr.contains("checkpoint.safetensors") && stderr.contains("previous checkpoint"),
             "{stderr}"
         );
-        assert!(place.read("run/model.ply") == expected);
-        fs::remove_file(place.path("run/done.json")).unwrap();
+        assert!(workspace.read("run/model.ply") == expected);
+        fs::remove_file(workspace.path("run/done.json")).unwrap();
     }
     fs::write(&checkpoint, &flipped).unwrap();
-    fs::write(place.path("run/checkpoint.before.safetensors"), &flipped).unwrap();
-    refused(&place.train("run", &format!("{options} --resume")), 3, &["checksum"]);
+    fs::write(workspace.path("run/checkpoint.before.safetensors"), &flipped).unwrap();
+    refused(&workspace.train("run", &format!("{options} --resume")), 3, &["checksum"]);
 }
 
 #[test]
 fn a_run_resumes_only_with_its_own_dataset() {
-    let place = Place::new();
-    succeed(&place.train("run", "--steps 12 --checkpoint-every 10"));
-    let resumed = place.train("run", "--steps 14 --resume");
-    let (photograph, other) = (place.path("set/low/003.png"), place.path("set/low/004.png"));
+    let workspace = Workspace::new();
+    succeed(&workspace.train("run", "--steps 12 --checkpoint-every 10"));
+    let resumed = workspace.train("run", "--steps 14 --resume");
+    let (photograph, other) =
+        (workspace.path("set/low/003.png"), workspace.path("set/low/004.png"));
     let before = fs::read(&photograph).unwrap();
     fs::copy(&other, &photograph).unwrap();
     refused(&resumed, 3, &["another dataset", "view 003 shows other pixels"]);
@@ -205,28 +213,28 @@ fn a_run_resumes_only_with_its_own_dataset() {
     let (_, stderr) = run(&resumed, 3);
     assert!(stderr.contains("another dataset (view 003 is gone)"), "{stderr}");
     fs::write(&photograph, before).unwrap();
-    let listing = place.path("set/transforms_train.json");
+    let listing = workspace.path("set/transforms_train.json");
     let text = fs::read_to_string(&listing).unwrap();
     fs::write(&listing, text.replace("\"fl_x\": ", "\"fl_x\": 1")).unwrap();
     refused(&resumed, 3, &["another dataset", "another camera or pose"]);
     // In another folder, it is the same dataset.
     fs::write(&listing, text).unwrap();
-    fs::rename(place.path("set"), place.path("moved")).unwrap();
+    fs::rename(workspace.path("set"), workspace.path("moved")).unwrap();
     succeed(&resumed.replace("/set ", "/moved "));
 }
 
 #[test]
 fn a_relative_dataset_means_the_same_from_everywhere() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let train = "train set --out run --steps 2 --curve ap3 --plan none";
-    let output = command(train).current_dir(place.0.path()).output().unwrap();
+    let output = command(train).current_dir(workspace.0.path()).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let eval = |config: &str| {
-        fs::write(place.path("run/config.toml"), config).unwrap();
-        succeed(&format!("eval {} --json", place.path("run").display()))
+        fs::write(workspace.path("run/config.toml"), config).unwrap();
+        succeed(&format!("eval {} --json", workspace.path("run").display()))
     };
-    let config = fs::read_to_string(place.path("run/config.toml")).unwrap();
-    let absolute = place.path("set").display().to_string();
+    let config = fs::read_to_string(workspace.path("run/config.toml")).unwrap();
+    let absolute = workspace.path("set").display().to_string();
     assert!(config.contains(&absolute), "{config}");
     let expected = eval(&config);
     assert_eq!(eval(&config.replace(&absolute, "../set")), expected, "from the run's folder");
@@ -234,42 +242,42 @@ fn a_relative_dataset_means_the_same_from_everywhere() {
 
 #[test]
 fn two_runs_and_a_resumed_one_have_equal_ledgers() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let options = "--steps 40 --hash-every 10 --checkpoint-every 25";
     for name in ["a", "b"] {
-        succeed(&place.train(name, options));
+        succeed(&workspace.train(name, options));
     }
-    let ledger = place.read("a/hashes.csv");
+    let ledger = workspace.read("a/hashes.csv");
     assert_eq!(ledger.iter().filter(|&&byte| byte == b'\n').count(), 5);
-    assert!(place.read("b/hashes.csv") == ledger);
-    fs::remove_file(place.path("b/done.json")).unwrap();
-    succeed(&place.train("b", &format!("{options} --resume")));
-    assert!(place.read("b/hashes.csv") == ledger);
-    succeed(&place.train("c", &format!("{options} --seed 11")));
-    assert!(place.read("c/hashes.csv") != ledger);
+    assert!(workspace.read("b/hashes.csv") == ledger);
+    fs::remove_file(workspace.path("b/done.json")).unwrap();
+    succeed(&workspace.train("b", &format!("{options} --resume")));
+    assert!(workspace.read("b/hashes.csv") == ledger);
+    succeed(&workspace.train("c", &format!("{options} --seed 11")));
+    assert!(workspace.read("c/hashes.csv") != ledger);
 }
 
 #[test]
 fn hostile_names_break_no_table_and_reach_no_terminal() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let wild = "a,\u{1b}[31mb";
     for (folder, stem) in [("low", "003"), ("high", "003")] {
-        let folder = place.path("set").join(folder);
+        let folder = workspace.path("set").join(folder);
         if folder.join(format!("{stem}.png")).exists() {
             fs::rename(folder.join(format!("{stem}.png")), folder.join(format!("{wild}.png")))
                 .unwrap();
         }
     }
-    let listing = place.path("set/transforms_train.json");
+    let listing = workspace.path("set/transforms_train.json");
     let text = fs::read_to_string(&listing).unwrap();
     let text = text.replace("low/003.png", "low/a,\\u001b[31mb.png");
     fs::write(&listing, text.replace("low/005.png", "low/gone\\u001b]0;x\\u0007.png")).unwrap();
-    let (stdout, stderr) = run(&place.train("run", "--steps 9"), 0);
+    let (stdout, stderr) = run(&workspace.train("run", "--steps 9"), 0);
     assert!(
         stderr.contains("gone") && !(stdout + &stderr).contains(['\u{1b}', '\u{7}']),
         "{stderr:?}"
     );
-    let log = fs::read_to_string(place.path("run/train.csv")).unwrap();
+    let log = fs::read_to_string(workspace.path("run/train.csv")).unwrap();
     assert_eq!(log.lines().count(), 10);
     assert!(log.contains("\"a,_[31mb\""), "{log}");
     refused("eval /nowhere\u{1b}[2J", 3, &[r"/nowhere\u{1b}[2J"]);
@@ -277,11 +285,13 @@ fn hostile_names_break_no_table_and_reach_no_terminal() {
 
 #[test]
 fn too_little_address_space_is_reported_before_a_driver_crashes() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let program = command("").get_program().to_str().unwrap().to_owned();
     for kilobytes in [300_000, 600_000] {
-        let line =
-            format!("ulimit -v {kilobytes}; exec {program} {}", place.train("run", "--steps 1"));
+        let line = format!(
+            "ulimit -v {kilobytes}; exec {program} {}",
+            workspace.train("run", "--steps 1")
+        );
         let output = Command::new("sh").args(["-c", &line]).output().unwrap();
         let stderr = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(4), "{stderr}");
@@ -291,10 +301,10 @@ fn too_little_address_space_is_reported_before_a_driver_crashes() {
 
 #[test]
 fn a_finished_run_is_recognised_without_decoding_a_photograph() {
-    let place = Place::new();
-    let train = place.train("run", "--steps 2 --resume");
+    let workspace = Workspace::new();
+    let train = workspace.train("run", "--steps 2 --resume");
     succeed(&train);
-    let photograph = place.path("set/low/001.png");
+    let photograph = workspace.path("set/low/001.png");
     let (bytes, time) = (fs::read(&photograph).unwrap(), modified(&photograph));
     // Of the same length and time, but not an image: decoding it would leave the view out.
     fs::write(&photograph, vec![0; bytes.len()]).unwrap();
@@ -304,7 +314,7 @@ fn a_finished_run_is_recognised_without_decoding_a_photograph() {
     fs::write(&photograph, &bytes).unwrap();
     set_modified(&photograph, time + Duration::from_secs(5));
     assert!(succeed(&train).contains("is done"));
-    fs::write(&photograph, fs::read(place.path("set/low/002.png")).unwrap()).unwrap();
+    fs::write(&photograph, fs::read(workspace.path("set/low/002.png")).unwrap()).unwrap();
     refused(&train, 3, &["view 001 shows other pixels"]);
 }
 

@@ -10,29 +10,29 @@ use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::{Gaussians, ply};
 
 use crate::common::command::{refused, run, succeed};
-use crate::common::place::Place;
+use crate::common::workspace::Workspace;
 
 #[test]
 fn a_run_starts_from_a_model_and_its_highest_sh_degree() {
-    let place = Place::new();
-    succeed(&place.train("first", "--steps 30"));
-    let model = place.path("first/model.ply");
-    succeed(&place.train("second", &format!("--steps 1 --init {}", model.display())));
+    let workspace = Workspace::new();
+    succeed(&workspace.train("first", "--steps 30"));
+    let model = workspace.path("first/model.ply");
+    succeed(&workspace.train("second", &format!("--steps 1 --init {}", model.display())));
     let [first, second] =
-        ["first", "second"].map(|run| ply::load(place.path(run).join("model.ply")).unwrap());
+        ["first", "second"].map(|run| ply::load(workspace.path(run).join("model.ply")).unwrap());
     // The first run has not reached a higher degree; the second uses it from its first step.
     assert_eq!([&first, &second].map(|model| model.shape.sh_degree), [0, 1]);
     assert_eq!(first.count, second.count);
     let moved = first.means().iter().zip(second.means()).map(|(a, b)| a.distance(*b));
     assert!(moved.fold(0.0, f32::max) < 0.05, "they began elsewhere");
-    let config = fs::read_to_string(place.path("second/config.toml")).unwrap();
+    let config = fs::read_to_string(workspace.path("second/config.toml")).unwrap();
     assert!(config.contains("first/model.ply"), "{config}");
 
     // From another program: without our features, with additional properties, of a lower degree.
     let bytes = with_property(&fs::read(&model).unwrap());
-    fs::write(place.path("foreign.ply"), bytes).unwrap();
-    let foreign = place.path("foreign.ply");
-    succeed(&place.train("third", &format!("--steps 1 --init {}", foreign.display())));
+    fs::write(workspace.path("foreign.ply"), bytes).unwrap();
+    let foreign = workspace.path("foreign.ply");
+    succeed(&workspace.train("third", &format!("--steps 1 --init {}", foreign.display())));
 }
 
 /// A binary PLY with an additional float in every vertex.
@@ -51,13 +51,13 @@ fn with_property(bytes: &[u8]) -> Vec<u8> {
 
 #[test]
 fn an_unsuitable_initial_model_is_refused_in_one_line_with_file_and_rule() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let file = |name: &str, bytes: &[u8]| {
-        fs::write(place.path(name), bytes).unwrap();
+        fs::write(workspace.path(name), bytes).unwrap();
     };
     // All zeros; the file is text.
-    ply::save(&Gaussians::zeros(2, 2), place.path("degree.ply")).unwrap();
-    let whole = String::from_utf8(place.read("degree.ply")).unwrap();
+    ply::save(&Gaussians::zeros(2, 2), workspace.path("degree.ply")).unwrap();
+    let whole = String::from_utf8(workspace.read("degree.ply")).unwrap();
     let header = |from: &str, to: &str| whole.replacen(from, to, 1).into_bytes();
     file("ascii.ply", &header("binary_little_endian", "ascii"));
     file("big.ply", &header("binary_little_endian", "binary_big_endian"));
@@ -71,17 +71,17 @@ fn an_unsuitable_initial_model_is_refused_in_one_line_with_file_and_rule() {
         ("origin.ply", "names the origin `1 2`, which is not three finite numbers"),
         ("none.ply", "none.ply"),
     ] {
-        let options = format!("--steps 1 --init {}", place.path(name).display());
-        refused(&place.train("run", &options), 3, &[name, rule]);
+        let options = format!("--steps 1 --init {}", workspace.path(name).display());
+        refused(&workspace.train("run", &options), 3, &[name, rule]);
     }
 }
 
 #[test]
 fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
-    let place = Place::new();
-    succeed(&place.train("run", "--steps 40"));
-    let (model, set) = (place.path("copy.ply"), place.path("set"));
-    fs::copy(place.path("run/model.ply"), &model).unwrap();
+    let workspace = Workspace::new();
+    succeed(&workspace.train("run", "--steps 40"));
+    let (model, set) = (workspace.path("copy.ply"), workspace.path("set"));
+    fs::copy(workspace.path("run/model.ply"), &model).unwrap();
     let (model, set) = (model.display(), set.display());
 
     let (scores, message) = run(&format!("eval {model} --dataset {set} --json"), 0);
@@ -90,22 +90,22 @@ fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
         let json: serde_json::Value = serde_json::from_str(json).unwrap();
         json["mean"]["psnr"].as_f64().unwrap()
     };
-    let own = succeed(&format!("eval {} --json", place.path("run").display()));
-    assert!((psnr(&scores) - psnr(&own)).abs() < 1e-6, "{scores} {own}");
+    let of_run = succeed(&format!("eval {} --json", workspace.path("run").display()));
+    assert!((psnr(&scores) - psnr(&of_run)).abs() < 1e-6, "{scores} {of_run}");
     refused(&format!("eval {model}"), 3, &["copy.ply", "--dataset"]);
 
-    let pictures = place.path("pictures");
+    let pictures = workspace.path("pictures");
     succeed(&format!("render {model} --dataset {set} --split test --out {}", pictures.display()));
     assert!(fs::read_dir(pictures).unwrap().count() > 0);
 
     for to in ["spz", "glb", "sog"] {
         succeed(&format!("export {model} --format {to} --up none"));
-        assert!(place.path(&format!("copy.{to}")).is_file(), "{to}");
+        assert!(workspace.path(&format!("copy.{to}")).is_file(), "{to}");
     }
     for (file, loss) in [("copy.spz", 0.5), ("copy.sog", 0.5)] {
-        let packed = place.path(file);
+        let packed = workspace.path(file);
         let shown = succeed(&format!("eval {} --dataset {set} --json", packed.display()));
-        assert!((psnr(&shown) - psnr(&own)).abs() < loss, "{file}: {shown} {own}");
+        assert!((psnr(&shown) - psnr(&of_run)).abs() < loss, "{file}: {shown} {of_run}");
     }
     succeed(&format!("export {model} --format html --dataset {set}"));
     refused(&format!("export {model} --format html"), 3, &["copy.ply", "--dataset"]);
@@ -132,31 +132,31 @@ fn without_facts(path: &Path) {
 
 #[test]
 fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_defaults() {
-    let place = Place::new();
-    succeed(&place.train("run", "--steps 5 --near 0.05 --raw-colors on"));
-    let own = place.path("run");
-    let scale = load_config(&own).unwrap().frame.unwrap_or_default().scale;
-    let model = Model::load(&own).unwrap();
+    let workspace = Workspace::new();
+    succeed(&workspace.train("run", "--steps 5 --near 0.05 --raw-colors on"));
+    let run_folder = workspace.path("run");
+    let scale = load_config(&run_folder).unwrap().frame.unwrap_or_default().scale;
+    let model = Model::load(&run_folder).unwrap();
     assert!((f64::from(model.near) * scale - 0.1).abs() < 1e-6, "{}", model.near);
     assert_eq!((model.max_alpha, model.raw_colors), (0.99, true));
     let settings = model.render_settings();
     assert_eq!((settings.near, settings.shape), (model.near, model.gaussians.shape));
 
     // The file alone and the exports state the same facts.
-    let file = own.join("model.ply");
+    let file = run_folder.join("model.ply");
     let header = String::from_utf8_lossy(&fs::read(&file).unwrap()[..300]).into_owned();
     for line in ["max_alpha 0.99", "raw_colors true"] {
         assert!(header.contains(&format!("comment nightsplat {line}\n")), "{header}");
     }
     assert_eq!(Model::load(&file).unwrap(), model);
     for name in ["a.ply", "a.spz", "a.sog", "saved.ply", "saved.spz", "saved.sog"] {
-        let path = place.path(name);
+        let path = workspace.path(name);
         match name.strip_prefix("a.") {
             Some(format) => {
                 let out = path.display();
                 succeed(&format!(
                     "export {} --format {format} --out {out} --up none",
-                    own.display()
+                    run_folder.display()
                 ));
             }
             None => model.save(&path).unwrap(),
@@ -166,7 +166,7 @@ fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_de
         assert_eq!(facts(&back), facts(&model), "{name}");
         assert_eq!(back.gaussians.count, model.gaussians.count, "{name}");
     }
-    let glb = place.path("saved.glb");
+    let glb = workspace.path("saved.glb");
     model.save(&glb).unwrap();
     let glb = fs::read(glb).unwrap();
     let length = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
@@ -178,9 +178,9 @@ fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_de
     // A run of a version whose files stated no facts uses its configuration, which has no law.
     let shown = Gaussians::open(&file).unwrap();
     without_facts(&file);
-    assert_eq!(Model::load(&own).unwrap(), Model { law: None, ..model });
+    assert_eq!(Model::load(&run_folder).unwrap(), Model { law: None, ..model });
     assert_eq!(Model::load(&file).unwrap(), Model::from(shown));
-    let set = place.path("set");
+    let set = workspace.path("set");
     let silent = format!("eval {} --dataset {}", file.display(), set.display());
     let (_, message) = run(&silent, 0);
     assert!(message.contains("model.ply: does not state its near plane"), "{message}");
@@ -234,13 +234,13 @@ fn an_invalid_fact_in_a_file_is_an_error_of_one_line() {
 
 #[test]
 fn an_export_keeps_the_origin_and_the_page_the_near_plane() {
-    let place = Place::new();
-    succeed(&place.train("run", "--steps 5 --near 0.5"));
-    let path = place.path("run/model.ply");
+    let workspace = Workspace::new();
+    succeed(&workspace.train("run", "--steps 5 --near 0.5"));
+    let path = workspace.path("run/model.ply");
     let mut gaussians = ply::load(&path).unwrap();
     gaussians.origin = DVec3::new(4_499_999.6, 519_997.7, 10_001.8);
     ply::save(&gaussians, &path).unwrap();
-    let (run, out) = (place.path("run"), place.path("out.ply"));
+    let (run, out) = (workspace.path("run"), workspace.path("out.ply"));
     let message =
         succeed(&format!("export {} --format ply --out {}", run.display(), out.display()));
     assert!(message.contains("world = position + 4499999.6 519997.7 10001.8"), "{message}");
@@ -259,11 +259,11 @@ fn an_export_keeps_the_origin_and_the_page_the_near_plane() {
 
 #[test]
 fn training_far_from_the_origin_of_the_world_says_what_positions_are_relative_to() {
-    let place = Place::new();
-    let near = succeed(&place.train("near", "--steps 2"));
+    let workspace = Workspace::new();
+    let near = succeed(&workspace.train("near", "--steps 2"));
     assert!(!near.contains("relative"), "{near}");
     for listing in ["transforms_train.json", "transforms_test.json"] {
-        let path = place.path("set").join(listing);
+        let path = workspace.path("set").join(listing);
         let mut listed: serde_json::Value =
             serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
         for frame in listed["frames"].as_array_mut().unwrap() {
@@ -272,9 +272,9 @@ fn training_far_from_the_origin_of_the_world_says_what_positions_are_relative_to
         }
         fs::write(&path, listed.to_string()).unwrap();
     }
-    let far = succeed(&place.train("far", "--steps 2"));
+    let far = succeed(&workspace.train("far", "--steps 2"));
     assert!(far.contains("model.ply: positions are relative"), "{far}");
-    let header = fs::read(place.path("far/model.ply")).unwrap();
+    let header = fs::read(workspace.path("far/model.ply")).unwrap();
     let header = String::from_utf8_lossy(&header[..400]).into_owned();
     let origin = header.lines().find(|line| line.contains("world = position + ")).unwrap();
     assert!(far.contains(origin.trim_start_matches("comment ")), "{origin}: {far}");

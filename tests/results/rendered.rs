@@ -6,7 +6,7 @@ use std::path::Path;
 use nightsplat::photographs::image::Image;
 
 use crate::common::command::{refused, succeed};
-use crate::common::place::Place;
+use crate::common::workspace::Workspace;
 
 fn image(path: &Path) -> Image {
     Image::load(path).unwrap()
@@ -14,13 +14,13 @@ fn image(path: &Path) -> Image {
 
 #[test]
 fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
-    succeed(&place.train("run", "--steps 40"));
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
+    succeed(&workspace.train("run", "--steps 40"));
     let render = |options: &str, out: &str| {
         succeed(&format!("render {} --split test {options} --out {}", path("run"), path(out)));
         let mut files: Vec<_> =
-            fs::read_dir(place.path(out)).unwrap().map(|entry| entry.unwrap().path()).collect();
+            fs::read_dir(workspace.path(out)).unwrap().map(|entry| entry.unwrap().path()).collect();
         files.sort();
         files.remove(0)
     };
@@ -42,10 +42,10 @@ fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
     let pixels = near.pixel_count();
     let yellow = [253.0, 231.0, 37.0].map(|value: f32| value / 255.0);
     for pixel in 0..pixels {
-        let own = [0, 1, 2].map(|plane| near.data[plane * pixels + pixel]);
+        let color = [0, 1, 2].map(|plane| near.data[plane * pixels + pixel]);
         assert!(
-            own == [0.0; 3] || own.iter().zip(yellow).all(|(a, b)| (a - b).abs() < 1e-3),
-            "{own:?}"
+            color == [0.0; 3] || color.iter().zip(yellow).all(|(a, b)| (a - b).abs() < 1e-3),
+            "{color:?}"
         );
     }
     refused(
@@ -57,36 +57,36 @@ fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
 
 #[test]
 fn views_and_paths_are_rendered_at_a_size_with_a_field_of_view_over_a_background() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
-    succeed(&place.train("run", "--steps 10"));
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
+    succeed(&workspace.train("run", "--steps 10"));
     let render =
         |options: &str, out: &str| format!("render {} {options} --out {}", path("run"), path(out));
     succeed(&render("--split test --size 64x24 --fov 20", "wide"));
-    let file = fs::read_dir(place.path("wide")).unwrap().next().unwrap().unwrap().path();
+    let file = fs::read_dir(workspace.path("wide")).unwrap().next().unwrap().unwrap().path();
     assert_eq!([image(&file).width, image(&file).height], [64, 24]);
 
     let keyframes = r#"{"nightsplat_path": 1, "fps": 2, "fov": 40, "size": [32, 16], "keyframes": [
         {"time": 0, "position": [0, 0, 0], "target": [0, 0, 100]},
         {"time": 2, "position": [0, 0, 0], "target": [100, 0, 100]}]}"#;
-    fs::write(place.path("path.json"), keyframes).unwrap();
+    fs::write(workspace.path("path.json"), keyframes).unwrap();
     let file = path("path.json");
     succeed(&render(&format!("--path {file} --background #ff0000"), "film"));
-    assert_eq!(fs::read_dir(place.path("film")).unwrap().count(), 5);
-    assert_eq!([image(&place.path("film/00000.png")).width], [32]);
+    assert_eq!(fs::read_dir(workspace.path("film")).unwrap().count(), 5);
+    assert_eq!([image(&workspace.path("film/00000.png")).width], [32]);
     // Far from everything, only the background is seen.
     let far = path("far.json");
     fs::write(
-        place.path("far.json"),
+        workspace.path("far.json"),
         keyframes.replace("[0, 0, 0]", "[0, 0, 1e5]").replace("100]", "1e7]"),
     )
     .unwrap();
     succeed(&render(&format!("--path {far} --frames 1 --background 1,0,0"), "far"));
-    let far = image(&place.path("far/00000.png"));
+    let far = image(&workspace.path("far/00000.png"));
     assert!(far.data[..512].iter().all(|value| *value == 1.0), "no red");
     assert!(far.data[512..].iter().all(|value| *value == 0.0));
 
-    fs::write(place.path("path.json"), keyframes.replace("path\": 1", "path\": 7")).unwrap();
+    fs::write(workspace.path("path.json"), keyframes.replace("path\": 1", "path\": 7")).unwrap();
     refused(&render(&format!("--path {file}"), "no"), 3, &["path.json", "version 7"]);
     for (options, part) in [
         ("--path nowhere.json", "nor a file"),
@@ -98,5 +98,5 @@ fn views_and_paths_are_rendered_at_a_size_with_a_field_of_view_over_a_background
     ] {
         refused(&render(options, "no"), 2, &[part]);
     }
-    assert!(!place.path("no").exists());
+    assert!(!workspace.path("no").exists());
 }

@@ -2,16 +2,16 @@
 
 use nightsplat::photographs::image::Image;
 use nightsplat::results::report::{
-    Best, Chart, Column, Comparison, Distribution, Facts, Mark, Picture, Report, Series, Table,
-    distributions,
+    Best, Chart, Column, Comparison, Distribution, Mark, NumberTable, Picture, Report, Series,
+    TextTable, distributions,
 };
 
 fn column(name: &str, digits: usize, best: Best) -> Column {
     Column { name: name.into(), digits, best }
 }
 
-fn table() -> Table {
-    Table {
+fn table() -> NumberTable {
+    NumberTable {
         title: "Scores <test>".into(),
         label: "curve".into(),
         columns: vec![
@@ -80,7 +80,7 @@ fn page(text: &str) -> String {
         title: text.into(),
         intro: vec![text.into()],
         links: vec![[text.into(), text.into()]],
-        facts: vec![Facts { title: text.into(), rows: vec![[text.into(), text.into()]] }],
+        facts: vec![TextTable { title: text.into(), rows: vec![[text.into(), text.into()]] }],
         tables: vec![table()],
         charts: vec![Chart::new(text, text, vec![series])],
         comparisons: vec![Comparison {
@@ -343,11 +343,11 @@ fn a_run_has_one_colour_in_every_chart_and_its_name_next_to_its_last_point() {
     assert!(!drawn.contains("lost"), "{drawn}");
     assert!(drawn.contains("the run &lt;fast&gt;") && !drawn.contains("NaN"), "{drawn}");
     // Two names at one place do not overlap.
-    let place = |name: &str| {
+    let workspace = |name: &str| {
         let before = drawn.split(&format!(">{name}</text>")).next().unwrap();
         before.rsplit("<text ").next().unwrap().to_owned()
     };
-    assert_ne!(place("fast").split(" class").next(), place("2").split(" class").next());
+    assert_ne!(workspace("fast").split(" class").next(), workspace("2").split(" class").next());
     let curve = svg(vec![series("a", 0, &[(1.0, 20.0), (9.0, 25.0)])]);
     assert_eq!((curve.matches("<polyline").count(), curve.matches("<path").count()), (1, 0));
     for points in [&[][..], &[(0.0, 1.0)], &[(-1.0, 2.0)], &[(1e-300, 1e300)]] {

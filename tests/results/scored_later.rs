@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use crate::common::command::{refused, run, succeed};
 use crate::common::lpips;
-use crate::common::place::Place;
+use crate::common::workspace::Workspace;
 
 fn json(stdout: &str) -> Value {
     serde_json::from_str(stdout).unwrap()
@@ -16,42 +16,42 @@ fn json(stdout: &str) -> Value {
 
 #[test]
 fn references_that_are_found_later_give_the_scores_of_a_dataset_that_had_them() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
-    succeed(&place.train("known", "--steps 20"));
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
+    succeed(&workspace.train("known", "--steps 20"));
     let known = json(&succeed(&format!("eval {} --json", path("known"))));
     // The same dataset, before anyone had photographed it in normal light.
-    fs::rename(place.path("set/high"), place.path("found")).unwrap();
-    succeed(&place.train("run", "--steps 20"));
-    assert!(place.model("run") == place.model("known"), "references changed the model");
-    let own = json(&succeed(&format!("eval {} --json", path("run"))));
-    assert_ne!(own["mean"]["psnr"], known["mean"]["psnr"]);
+    fs::rename(workspace.path("set/high"), workspace.path("found")).unwrap();
+    succeed(&workspace.train("run", "--steps 20"));
+    assert!(workspace.model("run") == workspace.model("known"), "references changed the model");
+    let scores_of_targets = json(&succeed(&format!("eval {} --json", path("run"))));
+    assert_ne!(scores_of_targets["mean"]["psnr"], known["mean"]["psnr"]);
     let eval = format!("eval {} --reference {}", path("run"), path("found"));
     let later = json(&succeed(&format!("{eval} --json")));
     assert_eq!((&later["mean"], &later["views"]), (&known["mean"], &known["views"]));
 
     // A model file alone is scored likewise, with the images and the page that are asked for.
-    fs::copy(place.path("run/model.ply"), place.path("model.ply")).unwrap();
+    fs::copy(workspace.path("run/model.ply"), workspace.path("model.ply")).unwrap();
     let more = format!("--save-images --report {}", path("page.html"));
     let eval = format!("eval {} --dataset {} ", path("model.ply"), path("set"));
     let reference = format!("--reference {}", path("found"));
     let of_file = json(&succeed(&format!("{eval} {reference} {more} --json")));
     let psnr = |scores: &Value| scores["mean"]["psnr"].as_f64().unwrap();
     assert!((psnr(&of_file) - psnr(&known)).abs() < 1e-9, "{of_file}");
-    assert!(fs::read_to_string(place.path("page.html")).unwrap().contains("reference image<"));
-    assert!(fs::read_dir(place.path("model.eval")).unwrap().count() > 0);
+    assert!(fs::read_to_string(workspace.path("page.html")).unwrap().contains("reference image<"));
+    assert!(fs::read_dir(workspace.path("model.eval")).unwrap().count() > 0);
 
-    fs::remove_file(place.path("page.html")).unwrap();
+    fs::remove_file(workspace.path("page.html")).unwrap();
     let nowhere = format!("{eval} --reference {} {more}", path("nowhere"));
     refused(&nowhere, 3, &["nowhere"]);
-    assert!(!place.path("page.html").exists());
+    assert!(!workspace.path("page.html").exists());
 }
 
 #[test]
 fn a_sweep_adds_lpips_to_its_tables_and_scores_no_run_again() {
-    let place = Place::new();
-    let path = |name: &str| place.path(name).display().to_string();
-    let weights = place.path("weights.safetensors");
+    let workspace = Workspace::new();
+    let path = |name: &str| workspace.path(name).display().to_string();
+    let weights = workspace.path("weights.safetensors");
     // The network has no output for smaller images.
     succeed(&format!("synth {} --views 9 --width 48 --height 36", path("large")));
     lpips::write(Network::Alex, &weights, |_, _, _| {});
@@ -69,18 +69,18 @@ fn a_sweep_adds_lpips_to_its_tables_and_scores_no_run_again() {
         let all = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
         all.filter(|path| path.join("model.ply").exists()).collect()
     };
-    let found = runs(&place.path("sweep"));
+    let found = runs(&workspace.path("sweep"));
     assert_eq!(found.len(), 2);
     for folder in &found {
         let eval = format!("eval {} --lpips {} --json", folder.display(), weights.display());
-        let own = json(&succeed(&eval))["mean"]["lpips"].as_f64().unwrap();
-        assert!(stdout.contains(&format!("{own:.3}")), "{own}: {stdout}");
+        let lpips_of_run = json(&succeed(&eval))["mean"]["lpips"].as_f64().unwrap();
+        assert!(stdout.contains(&format!("{lpips_of_run:.3}")), "{lpips_of_run}: {stdout}");
     }
     let (again, _) = run(&with, 0);
     assert_eq!(stdout, again);
 
     fs::write(&weights, "no weights").unwrap();
-    let other = place.path("other.safetensors");
+    let other = workspace.path("other.safetensors");
     fs::write(&other, "no weights").unwrap();
     refused(&format!("{sweep} --lpips {}", other.display()), 3, &["other.safetensors"]);
     refused(&format!("{sweep} --lpips-range unit"), 2, &["--lpips <WEIGHTS>"]);

@@ -7,7 +7,7 @@ use std::path::Path;
 use glam::DVec3;
 use nightsplat::base::random::Stream;
 use nightsplat::results::export::Provenance;
-use nightsplat::results::export::streamed::{self, Division, INDEX, Tile, Written};
+use nightsplat::results::export::streamed::{self, Division, INDEX, TileLoader, Written};
 use nightsplat::splats::levels::level;
 use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::{Gaussians, ply};
@@ -33,8 +33,11 @@ fn tiles() -> [Gaussians; 2] {
 
 fn written(folder: &Path, models: &[Gaussians], division: Division) -> nightsplat::Result<Written> {
     let name = |index: usize| Path::new("model").join(index.to_string());
-    let tiles: Vec<Tile<'_>> =
-        models.iter().enumerate().map(|(index, model)| Tile::whole(&name(index), model)).collect();
+    let tiles: Vec<TileLoader<'_>> = models
+        .iter()
+        .enumerate()
+        .map(|(index, model)| TileLoader::whole(&name(index), model))
+        .collect();
     streamed::write(folder, &tiles, &Provenance::default(), division)
 }
 
@@ -73,18 +76,18 @@ fn leaves(node: &Value) -> Vec<&Value> {
 }
 
 /// The largest distance, and the largest differences of scales, opacities and colours, of Gaussians and their nearest.
-fn errors(own: &Gaussians, other: &Gaussians) -> [f32; 4] {
-    (0..own.count).fold([0.0; 4], |most, i| {
-        let offset = (own.origin - other.origin).as_vec3();
-        let distance = |j: &usize| (own.means()[i] + offset).distance(other.means()[*j]);
+fn errors(gaussians: &Gaussians, other: &Gaussians) -> [f32; 4] {
+    (0..gaussians.count).fold([0.0; 4], |most, i| {
+        let offset = (gaussians.origin - other.origin).as_vec3();
+        let distance = |j: &usize| (gaussians.means()[i] + offset).distance(other.means()[*j]);
         let j = (0..other.count).min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap();
         let opacity =
             |model: &Gaussians, index: usize| 1.0 / (1.0 + (-model.raw_opacities()[index]).exp());
         let error = [
             distance(&j),
-            (own.log_scales()[i] - other.log_scales()[j]).abs().max_element(),
-            (opacity(own, i) - opacity(other, j)).abs(),
-            (own.dc()[i] - other.dc()[j]).abs().max_element(),
+            (gaussians.log_scales()[i] - other.log_scales()[j]).abs().max_element(),
+            (opacity(gaussians, i) - opacity(other, j)).abs(),
+            (gaussians.dc()[i] - other.dc()[j]).abs().max_element(),
         ];
         [0, 1, 2, 3].map(|k| most[k].max(error[k]))
     })
@@ -117,15 +120,15 @@ fn the_index_finds_every_gaussian_of_every_level_once_and_chunks_are_our_levels(
             .collect();
         assert!(errors.len() == 3 && errors[0] == 0.0 && errors.is_sorted(), "{errors:?}");
         for (level, found) in found.iter_mut().enumerate() {
-            let place = &leaf["lods"][level.to_string()];
+            let workspace = &leaf["lods"][level.to_string()];
             let [file, offset, count] =
-                ["file", "offset", "count"].map(|key| place[key].as_u64().unwrap() as usize);
+                ["file", "offset", "count"].map(|key| workspace[key].as_u64().unwrap() as usize);
             let name = names[file].as_str().unwrap();
             assert!(name.starts_with(&format!("{level}_")), "{name}");
             assert_eq!(offset, ends[file], "{name}: a gap");
             ends[file] += count;
-            let own: Vec<u32> = (offset as u32..(offset + count) as u32).collect();
-            let cell = chunk(folder.path(), name).select(&own);
+            let indices: Vec<u32> = (offset as u32..(offset + count) as u32).collect();
+            let cell = chunk(folder.path(), name).select(&indices);
             for mean in cell.means() {
                 let mean = mean.as_dvec3();
                 assert!(
@@ -157,8 +160,11 @@ fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
         let path = entry.unwrap().path();
         let name = path.file_name().unwrap().to_string_lossy().into_owned();
         match path.is_dir() {
-            true => all
-                .extend(files(&path).into_iter().map(|(own, bytes)| (name.clone() + &own, bytes))),
+            true => all.extend(
+                files(&path)
+                    .into_iter()
+                    .map(|(name_below, bytes)| (name.clone() + &name_below, bytes)),
+            ),
             false => all.push((name, fs::read(&path).unwrap())),
         }
     }
@@ -190,7 +196,7 @@ fn a_folder_with_anything_else_and_tiles_that_changed_are_refused_and_nothing_is
     assert!(problem.contains("letter.txt") && files(folder.path()).len() == 1, "{problem}");
     fs::remove_file(folder.path().join("letter.txt")).unwrap();
 
-    let mut tile = Tile::whole(Path::new("0007.ply"), &model);
+    let mut tile = TileLoader::whole(Path::new("0007.ply"), &model);
     tile.count += 1;
     let provenance = Provenance::default();
     let problem = streamed::write(folder.path(), &[tile], &provenance, division).unwrap_err();

@@ -29,7 +29,11 @@ fn are_upright(page: &Path) {
     let pictures: Vec<&str> = html.split("data:image/png;base64,").skip(1).collect();
     let upright = base64(&header(32, 40));
     assert!(!pictures.is_empty(), "{}", page.display());
-    assert!(pictures.iter().all(|own| own.starts_with(&upright)), "{}", page.display());
+    assert!(
+        pictures.iter().all(|page_picture| page_picture.starts_with(&upright)),
+        "{}",
+        page.display()
+    );
 }
 
 #[test]

@@ -60,9 +60,9 @@ fn raised(count: usize, status: u32, rest: StorageFormat) -> [Gaussians; 2] {
 /// the kernel counts as seeing it counts here, too.
 fn pixels(gaussians: &Gaussians, i: usize, camera: &Camera) -> Option<f64> {
     let point = camera.view_from_world.transform_point3(gaussians.means()[i].as_dvec3());
-    let place = camera.focal * point.truncate() / point.z + camera.principal_point;
+    let position = camera.focal * point.truncate() / point.z + camera.principal_point;
     let size = DVec2::new(camera.width.into(), camera.height.into());
-    let is_seen = point.z > 0.2 && (place / size - 0.5).abs().max_element() < 0.651;
+    let is_seen = point.z > 0.2 && (position / size - 0.5).abs().max_element() < 0.651;
     let smallest = f64::from(gaussians.log_scales()[i].min_element()).exp();
     is_seen.then_some(smallest * camera.focal.max_element() / point.z)
 }

@@ -20,7 +20,9 @@ const BATCH: usize = 2176;
 
 /// A device that is taken for a GPU.
 fn little_gpu() -> Gpu {
-    gpu_with(|own| (own.is_cpu, own.max_storage_buffer_range) = (false, LITTLE))
+    gpu_with(|properties| {
+        (properties.is_cpu, properties.max_storage_buffer_range) = (false, LITTLE);
+    })
 }
 
 #[test]
@@ -39,8 +41,8 @@ fn the_planes_of_a_gpu_are_written_column_by_column_and_read_back_whole() {
         }
         // Neighbouring Gaussians of a batch have neighbouring words.
         for batch in all.iter().filter(|batch| batch.count > 1) {
-            let own = gpu.read(batch.planes(&buffer).unwrap()).unwrap();
-            let second = &own[(before_rest + 1) * batch.count..];
+            let of_batch = gpu.read(batch.planes(&buffer).unwrap()).unwrap();
+            let second = &of_batch[(before_rest + 1) * batch.count..];
             assert_eq!(second[1] - second[0], 24.0);
         }
     }
@@ -57,9 +59,9 @@ fn planes_beyond_the_largest_buffer_are_written_and_read_back_whole() {
 }
 
 fn gpu_of_little_buffers() -> Gpu {
-    gpu_with(|own| {
-        own.max_buffer_size = LITTLE;
-        own.max_storage_buffer_range = LITTLE.min(own.max_storage_buffer_range);
+    gpu_with(|properties| {
+        properties.max_buffer_size = LITTLE;
+        properties.max_storage_buffer_range = LITTLE.min(properties.max_storage_buffer_range);
     })
 }
 
@@ -84,13 +86,13 @@ fn written_and_read_back(gpu: &Gpu) {
         }
         // The scales of each batch's last Gaussian are at the addresses that its kernels read.
         if let Some(batch) = all.iter().filter(|batch| batch.count > 0).last() {
-            let own = gpu.read(batch.planes(&buffer).unwrap()).unwrap();
+            let of_batch = gpu.read(batch.planes(&buffer).unwrap()).unwrap();
             let of = |count: usize, parameters: &[f32]| {
                 let mut gaussians = Gaussians::zeros(count, shape);
                 gaussians.parameters.copy_from_slice(parameters);
                 gaussians
             };
-            let last = of(batch.count, &own).log_scales()[batch.count - 1];
+            let last = of(batch.count, &of_batch).log_scales()[batch.count - 1];
             let whole = of(count, &planes);
             assert_eq!(last, whole.log_scales()[count - 1]);
         }
@@ -112,12 +114,12 @@ fn columns_that_are_not_trained_take_no_memory_and_are_read_as_zeros() {
             let read = trained.read(&gpu, &buffer).unwrap();
             assert!(read[frozen..] == planes[frozen..]);
             // Up to three floats share a vector with the first trained one.
-            assert!(read[..frozen.saturating_sub(3)].iter().all(|own| *own == 0.0));
+            assert!(read[..frozen.saturating_sub(3)].iter().all(|value| *value == 0.0));
             let whole = all.upload(&gpu, "whole", &planes).unwrap();
             for (trained, whole_batch) in trained.iter().zip(all.iter()) {
-                let own = gpu.read(trained.planes(&buffer).unwrap()).unwrap();
+                let of_batch = gpu.read(trained.planes(&buffer).unwrap()).unwrap();
                 let expected = gpu.read(whole_batch.planes(&whole).unwrap()).unwrap();
-                assert!(expected.ends_with(&own));
+                assert!(expected.ends_with(&of_batch));
             }
         }
     }
@@ -209,7 +211,7 @@ fn training_as_on_a_gpu_gives_the_bits_of_training_as_on_a_cpu() {
         };
         let expected = train(&gpu());
         assert!(expected.shape.sh_degree == 3 && expected.count > BATCH);
-        for gpu in [gpu_with(|own| own.is_cpu = false), little_gpu()] {
+        for gpu in [gpu_with(|properties| properties.is_cpu = false), little_gpu()] {
             assert!(train(&gpu) == expected, "{rest:?} {moments:?}");
         }
     }
@@ -218,7 +220,9 @@ fn training_as_on_a_gpu_gives_the_bits_of_training_as_on_a_cpu() {
 #[test]
 fn passes_in_batches_match_their_references() {
     let dataset = views();
-    let gpu = gpu_with(|own| (own.is_cpu, own.max_storage_buffer_range) = (true, LITTLE));
+    let gpu = gpu_with(|properties| {
+        (properties.is_cpu, properties.max_storage_buffer_range) = (true, LITTLE);
+    });
     let mut trainer = Trainer::new(&gpu, config(), &dataset).unwrap();
     advance(&mut trainer, 22);
     let batches = trainer.gaussian_count().div_ceil(BATCH);
@@ -257,21 +261,21 @@ fn gaussians_beyond_a_binding_are_rendered() {
         return not_run("lavapipe", format_args!("this device binds {binding} bytes"));
     }
     let seen = Setup::new(500, [64, 48], shape, 5);
-    let own = seen.gaussians();
+    let visible = seen.gaussians();
     let mut all = Gaussians::zeros(hidden + seen.count, shape);
     let out_of_view =
         seen.camera.view_from_world.inverse().transform_point3(DVec3::NEG_Z).as_vec3();
     all.means_mut()[..hidden].fill(out_of_view);
     let copies: [fn(&mut Gaussians, &Gaussians, usize); 6] = [
-        |all, own, at| all.means_mut()[at..].copy_from_slice(own.means()),
-        |all, own, at| all.quats_mut()[at..].copy_from_slice(own.quats()),
-        |all, own, at| all.log_scales_mut()[at..].copy_from_slice(own.log_scales()),
-        |all, own, at| all.raw_opacities_mut()[at..].copy_from_slice(own.raw_opacities()),
-        |all, own, at| all.dc_mut()[at..].copy_from_slice(own.dc()),
-        |all, own, at| all.rest_mut()[15 * at..].copy_from_slice(own.rest()),
+        |all, visible, at| all.means_mut()[at..].copy_from_slice(visible.means()),
+        |all, visible, at| all.quats_mut()[at..].copy_from_slice(visible.quats()),
+        |all, visible, at| all.log_scales_mut()[at..].copy_from_slice(visible.log_scales()),
+        |all, visible, at| all.raw_opacities_mut()[at..].copy_from_slice(visible.raw_opacities()),
+        |all, visible, at| all.dc_mut()[at..].copy_from_slice(visible.dc()),
+        |all, visible, at| all.rest_mut()[15 * at..].copy_from_slice(visible.rest()),
     ];
-    copies.iter().for_each(|copy| copy(&mut all, &own, hidden));
-    let [alone, among] = [&own, &all].map(|gaussians| {
+    copies.iter().for_each(|copy| copy(&mut all, &visible, hidden));
+    let [alone, among] = [&visible, &all].map(|gaussians| {
         let settings = RenderSettings { shape, ..RenderSettings::default() };
         let mut renderer = Renderer::new(&gpu, settings).unwrap();
         renderer.reserve(gaussians.count, [&seen.camera]).unwrap();

@@ -82,7 +82,7 @@ fn assert_agrees(what: &str, report: &CheckReport) {
 
 /// A device that takes the passes of a CPU, whatever it is.
 fn as_a_cpu() -> Gpu {
-    gpu_with(|own| own.is_cpu = true)
+    gpu_with(|properties| properties.is_cpu = true)
 }
 
 /// Runs three checked steps, including density control; returns the kernels that ran.
@@ -131,7 +131,7 @@ fn every_pass_of_a_step_agrees_with_its_reference_for_every_part_of_the_model() 
 
 #[test]
 fn every_pass_of_a_step_of_a_gpu_agrees_with_its_reference() {
-    let gpu = gpu_with(|own| own.is_cpu = false);
+    let gpu = gpu_with(|properties| properties.is_cpu = false);
     let plain = assert_steps_agree_on(&gpu, "plain", &config(&[]));
     for kernel in ["ssim_forward", "ssim_backward", "adam_gaussian"] {
         assert!(plain.contains(kernel), "{kernel} is not in {plain:?}");
@@ -207,7 +207,7 @@ fn every_pass_of_the_pseudo_gt_agrees_with_its_reference_for_every_curve() {
             let pseudo_gt = PseudoGt::new(&gpu, &settings)?;
             let image = gpu.buffer("image", &dark(47 * 33))?;
             // Longer than the image: the values beyond it are undefined.
-            let curve = settings.parameters(&Statistics::of(&dark(47 * 33)));
+            let curve = settings.parameters(&Statistics::new(&dark(47 * 33)));
             let parameters = gpu.buffer("tone", &[curve; 3])?;
             let mut target = gpu.zeros("target", image.len())?;
             gpu.run("pseudo-GT", |pass| pseudo_gt.map(pass, &image, &parameters, 1, &mut target))

@@ -100,10 +100,10 @@ fn errors_of(count: usize) -> [f64; 2] {
         );
     }
     let backward = (0..RECORD).map(|k| {
-        let own = |values: &dyn Fn(usize) -> f64| {
+        let norm = |values: &dyn Fn(usize) -> f64| {
             (0..count).map(|i| values(RECORD * i + k).abs()).fold(0.0, f64::max)
         };
-        own(&|at| f64::from(sums[at]) - gradient_records[at]) / own(&|at| gradient_records[at])
+        norm(&|at| f64::from(sums[at]) - gradient_records[at]) / norm(&|at| gradient_records[at])
     });
     [forward / UNIT, backward.fold(0.0, f64::max) / UNIT]
 }
@@ -213,8 +213,8 @@ fn adam_errors(steps: u64) -> Vec<PlaneError> {
         (0..GAUSSIANS * COLUMNS).map(|at| 1.5 * (at as f32 * 0.7).sin()).collect();
     let (actual, expected) = (adam_on_device(steps, &start), adam_in_f64(steps, &start));
     let of_plane = |AttributePlane { column, width, .. }| {
-        let own = GAUSSIANS * column..GAUSSIANS * (column + width);
-        let most = |of: &dyn Fn(usize) -> f64| own.clone().map(of).fold(0.0, f64::max);
+        let plane = GAUSSIANS * column..GAUSSIANS * (column + width);
+        let most = |of: &dyn Fn(usize) -> f64| plane.clone().map(of).fold(0.0, f64::max);
         let largest = most(&|at| expected[at].abs().max(f64::from(start[at]).abs()));
         PlaneError {
             error: most(&|at| (f64::from(actual[at]) - expected[at]).abs()),
@@ -262,7 +262,7 @@ fn percentiles_and_means_of_more_than_sixteen_million_pixels_are_exact() {
     let plane = (0..pixels).map(|i| if pixels - 1 - i <= lower { 0.25 } else { 0.5 });
     let mut luminances: Vec<f32> = plane.collect();
     assert_eq!(percentile(&mut luminances, 8), 0.25 + 0.25 * weight);
-    let statistics = Statistics::of(&luminances.repeat(3));
+    let statistics = Statistics::new(&luminances.repeat(3));
     let mean = 0.25 * (1.0 + (pixels - 1 - lower) as f64 / pixels as f64);
     for found in [statistics.mean, statistics.mean_luminance] {
         assert!((f64::from(found) / mean - 1.0).abs() < 1e-7, "{found}, not {mean}");

@@ -1,7 +1,7 @@
 //! How a split in density control changes the coverage of images, on the host.
 
 use glam::{Quat, Vec3};
-use nightsplat::reference::densify_scatter::{Shape, half_of};
+use nightsplat::reference::densify_scatter::{ChildGaussian, half_of};
 
 fn opacity(raw: f32) -> f64 {
     1.0 / (1.0 + f64::from(-raw).exp())
@@ -9,8 +9,8 @@ fn opacity(raw: f32) -> f64 {
 
 /// Composited alpha of Gaussians without rotation, seen along a direction in the x-z plane; image x is in that plane,
 /// image y perpendicular to it.
-fn alpha(shapes: &[Shape], angle: f64, [x, y]: [f64; 2]) -> f64 {
-    let transmitted = |shape: &Shape| {
+fn alpha(shapes: &[ChildGaussian], angle: f64, [x, y]: [f64; 2]) -> f64 {
+    let transmitted = |shape: &ChildGaussian| {
         let scales = shape.log_scales.to_array().map(|log| f64::from(log).exp());
         let center = f64::from(shape.mean.x) * angle.sin();
         let variance = (scales[0] * angle.sin()).powi(2) + (scales[2] * angle.cos()).powi(2);
@@ -26,7 +26,7 @@ fn two_halves_cover_what_their_parent_covered_from_every_side() {
     const STEPS: i32 = 48;
     for raw_opacity in [-4.0_f32, -1.0, 0.0, 1.0, 3.0, 6.0] {
         let log_scales = Vec3::new(0.0, 0.5f32.ln(), 0.5f32.ln());
-        let parent = Shape { mean: Vec3::ZERO, log_scales, raw_opacity };
+        let parent = ChildGaussian { mean: Vec3::ZERO, log_scales, raw_opacity };
         let halves = [0, 1].map(|copy| half_of(&parent, Quat::IDENTITY, copy));
         assert_eq!(halves[0].mean, -halves[1].mean);
         // Sums over directions, weighted by area on the sphere: before, after, squared difference, squared before.
@@ -35,9 +35,9 @@ fn two_halves_cover_what_their_parent_covered_from_every_side() {
             let angle = (f64::from(step) + 0.5) / 8.0 * std::f64::consts::FRAC_PI_2;
             let mut covered = [0.0; 2];
             for i in 0..STEPS * STEPS {
-                let place = [i % STEPS, i / STEPS].map(|k| (f64::from(k) + 0.5) / 6.0 - 4.0);
+                let pixel = [i % STEPS, i / STEPS].map(|k| (f64::from(k) + 0.5) / 6.0 - 4.0);
                 let (before, after) =
-                    (alpha(&[parent], angle, place), alpha(&halves, angle, place));
+                    (alpha(&[parent], angle, pixel), alpha(&halves, angle, pixel));
                 covered[0] += before;
                 covered[1] += after;
                 let terms = [before, after, (after - before).powi(2), before * before];

@@ -30,8 +30,8 @@ fn camera(coefficients: [f64; 4]) -> Camera {
     }
 }
 
-fn reference(camera: &Camera) -> camera::Camera {
-    camera::Camera::from(&kernels::Camera::from(&Patch::from(camera)))
+fn reference(camera: &Camera) -> camera::ReferenceCamera {
+    camera::ReferenceCamera::from(&kernels::Camera::from(&Patch::from(camera)))
 }
 
 /// The formula from the documentation of `cv::fisheye::projectPoints`.
@@ -234,8 +234,8 @@ fn one_renderer_renders_a_pinhole_and_a_fisheye_in_turn() {
     for _ in 0..2 {
         for (setup, alone) in [&pinhole, &of_fisheye].into_iter().zip(&alone) {
             let Setup { camera, options, .. } = setup;
-            let own = renderer.render_channels(&gaussians, camera, options).unwrap();
-            assert!(own == *alone, "{:?}", camera.model);
+            let rendered = renderer.render_channels(&gaussians, camera, options).unwrap();
+            assert!(rendered == *alone, "{:?}", camera.model);
         }
     }
 }

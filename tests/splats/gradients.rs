@@ -4,7 +4,7 @@ use glam::{DVec2, DVec3};
 use nightsplat::camera::CameraModel;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::reference;
-use nightsplat::reference::camera::Model;
+use nightsplat::reference::camera::ReferenceLens;
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::lamp::Lamp;
 use nightsplat::splats::scene::Shape;
@@ -111,7 +111,7 @@ fn the_gradient_of_lit_colors_and_of_their_lamp_agrees_with_central_differences(
             let mut loss = |by: f64| {
                 let mut moved = numbers;
                 moved[number] += by;
-                chain.lamp = Some(reference::lamp::Lamp::of(&moved));
+                chain.lamp = Some(reference::lamp::ReferenceLamp::from_numbers(&moved));
                 chain.loss(&parameters, &background)
             };
             let expected = (loss(step) - loss(-step)) / (2.0 * step);
@@ -184,7 +184,7 @@ fn coefficients_above_the_degree_in_use_have_no_gradient() {
 fn the_gradient_is_correct_where_the_slope_is_clamped() {
     let mut setup = Setup::new(5, SIZE, 1, 41);
     let camera = setup.camera();
-    let Model::Pinhole(pinhole) = &camera.model else { panic!("{camera:?}") };
+    let ReferenceLens::Pinhole(pinhole) = &camera.model else { panic!("{camera:?}") };
     for (i, x, y) in [(0, 1.3, 0.5), (1, -0.4, 0.4), (2, 0.5, 1.5), (3, 1.3, -0.3)] {
         let depth = 2.0 + 0.3 * i as f64;
         let mean = setup.at_pixel(DVec2::new(x, y) * camera.size, depth);

@@ -6,7 +6,7 @@ use nightsplat::camera::Camera;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::metrics::psnr;
-use nightsplat::reference::densify_scatter::{Shape as Split, half_of};
+use nightsplat::reference::densify_scatter::{ChildGaussian as Split, half_of};
 use nightsplat::splats::levels::{Cells, coarser, level};
 use nightsplat::splats::model::Model;
 use nightsplat::splats::render::{RenderOptions, Renderer};
@@ -72,8 +72,8 @@ fn two_equal_gaussians_become_one_in_their_place_that_covers_as_much() {
         assert!(merged.means()[0].distance(one.means()[0]) < 1e-6);
         let growth = covariance(&merged, 0).x_axis.x / covariance(&one, 0).x_axis.x;
         assert!(relative(covariance(&merged, 0), covariance(&one, 0) * growth) < 1e-5);
-        for (own, other) in merged.rest().iter().zip(one.rest()) {
-            assert!(own.distance(*other) < 1e-6);
+        for (coefficient, other) in merged.rest().iter().zip(one.rest()) {
+            assert!(coefficient.distance(*other) < 1e-6);
         }
         assert!(merged.dc()[0].distance(one.dc()[0]) < 1e-6 && change >= 0.0);
         // The integral of 1 - (1 - o G)^2 is that of o (2 - o / 2) G.
@@ -124,7 +124,7 @@ fn one_that_is_not_merged_keeps_its_numbers() {
     let (next, _) = coarser(&three);
     assert_eq!((next.count, next.origin), (2, three.origin));
     let far = next.means().iter().position(|mean| mean.x > 10.0).unwrap();
-    let kept = |own: &Gaussians, index: usize| own.select(&[index as u32]);
+    let kept = |model: &Gaussians, index: usize| model.select(&[index as u32]);
     assert_eq!(kept(&next, far), kept(&three, 1));
 }
 
@@ -162,10 +162,10 @@ fn wall() -> Gaussians {
         let draw = |k: u64| stream.uniform(8 * index as u64 + k) as f32;
         let on_wall = index < SIDES[0] * SIDES[1];
         let (x, y) = ((index % SIDES[0]) as f32, (index / SIDES[0]) as f32);
-        let place =
+        let position =
             Vec3::new(0.07 * (x - 27.5 + 0.4 * draw(0)), 0.07 * (y - 19.5 + 0.4 * draw(1)), 0.0);
         wall.means_mut()[index] = match on_wall {
-            true => place,
+            true => position,
             false => Vec3::new(3.0 * draw(0) - 1.5, 0.4 + 0.1 * draw(1), -0.5 - 0.2 * draw(2)),
         };
         wall.log_scales_mut()[index] = match on_wall {
@@ -174,14 +174,14 @@ fn wall() -> Gaussians {
         };
         wall.quats_mut()[index] = [1.0, 0.0, 0.0, 0.1 * draw(3)];
         wall.raw_opacities_mut()[index] = raw(0.9);
-        let wave = |k: f32| (2.0 * place.x + k).sin() * (1.7 * place.y - k).cos();
+        let wave = |k: f32| (2.0 * position.x + k).sin() * (1.7 * position.y - k).cos();
         wall.dc_mut()[index] = match on_wall {
             true => Vec3::new(wave(0.0), wave(1.0), wave(2.0)) + 0.4 * draw(4),
             false => Vec3::new(-0.8, 0.6, 0.9) + 0.3 * draw(4),
         };
         let width = rest_coefficients(1);
         for value in &mut wall.rest_mut()[width * index..][..width] {
-            *value = Vec3::splat(0.1 * place.x);
+            *value = Vec3::splat(0.1 * position.x);
         }
     }
     wall

@@ -72,7 +72,7 @@ fn what_exceeds_the_memory_is_left_out_without_a_flag() {
     assert_eq!((kept, status[1]), (0, u32::MAX));
 }
 
-/// What `emit` writes for three Gaussians in a view of four tiles: tiles, intersections, Gaussians, ranges.
+/// What `emit` writes for three Gaussians in a view of four tiles, intersections, Gaussians, ranges.
 fn emitted(count: u32, tile_counts: Vec<u32>) -> (Vec<u32>, Vec<u32>, Vec<u32>, Vec<UVec2>) {
     let setup = Setup::new(3, [32, 32], 0, 1);
     let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
@@ -159,9 +159,9 @@ fn every_tile_finds_its_run_among_any_number_of_intersections() {
         tiles.sort_unstable();
         let (ranges, _) = tile_runs(tiles.clone(), u32::MAX);
         for (tile, range) in (0..120).zip(ranges) {
-            let own = &tiles[range.x as usize..range.y as usize];
+            let run = &tiles[range.x as usize..range.y as usize];
             let all = tiles.iter().filter(|&&other| other == tile).count();
-            assert!(own.len() == all && own.iter().all(|&other| other == tile), "{count}: {tile}");
+            assert!(run.len() == all && run.iter().all(|&other| other == tile), "{count}: {tile}");
         }
     }
 }
@@ -257,7 +257,7 @@ fn gaussians_that_cover_the_whole_of_a_large_image_fill_their_slots_and_are_summ
     let size = UVec2::new(4096, 2176);
     let (tiles, intersection_ranges, per_splat) = emit_wide(9, size, 0);
     assert!(per_splat > 32_000 && tiles.len() == 9 * per_splat as usize);
-    assert!(tiles.chunks(per_splat as usize).all(|own| (0..per_splat).eq(own.iter().copied())));
+    assert!(tiles.chunks(per_splat as usize).all(|chunk| (0..per_splat).eq(chunk.iter().copied())));
     let mut random = Random::new(3);
     let mut number = || random.between(-1.0, 1.0) as f32;
     let mut record = || array::from_fn(|_| number());
@@ -286,7 +286,7 @@ fn a_view_has_at_most_the_tiles_that_a_subgroup_of_covering_gaussians_can_proces
         return not_run("lavapipe", "this device has no loop limit");
     }
     // Of the tile of a CPU.
-    let cpu = gpu_with(|own| own.is_cpu = true);
+    let cpu = gpu_with(|properties| properties.is_cpu = true);
     let mut renderer = Renderer::new(&cpu, Setup::new(1, [32, 32], 0, 1).settings).unwrap();
     let view = |size| Setup::new(1, size, 0, 1).camera;
     renderer.reserve(1, [&view([8192, 16])]).unwrap();
@@ -382,7 +382,7 @@ fn more_splats_on_a_tile_than_the_device_can_process_are_a_clear_error() {
         return;
     }
     let setup = splats_per_tile(300_000);
-    let cpu = gpu_with(|own| own.is_cpu = true);
+    let cpu = gpu_with(|properties| properties.is_cpu = true);
     let gaussians = setup.gaussians().upload(&cpu).unwrap();
     let mut renderer = Renderer::new(&cpu, setup.settings).unwrap();
     renderer.reserve(setup.count, [&setup.camera]).unwrap();

@@ -29,17 +29,17 @@ fn config(not_finite: NotFinite) -> TrainConfig {
 #[test]
 fn a_not_finite_value_ends_the_run_at_its_own_step_with_view_and_place_and_changes_nothing() {
     let dataset = dataset(6, [40, 30]);
-    for (defect, place) in [(BAD_LOSS, "L1"), (bad_gradient(), "a gradient")] {
+    for (defect, name) in [(BAD_LOSS, "L1"), (bad_gradient(), "a gradient")] {
         let mut trainer = Trainer::new(&gpu(), config(NotFinite::Stop), &dataset).unwrap();
         advance(&mut trainer, 3);
         let before = trainer.gaussians().unwrap();
         let (done, _) = with_defect(defect, || trainer.check_step());
         let Err(Error::NotFinite { step, view, what }) = done else {
-            panic!("{place}: {done:?}");
+            panic!("{name}: {done:?}");
         };
-        assert_eq!((step, what.to_lowercase().as_str()), (4, place.to_lowercase().as_str()));
-        assert!(dataset.views.iter().any(|own| own.name == view), "{view}");
-        assert!(trainer.gaussians().unwrap() == before && trainer.steps_done() == 3, "{place}");
+        assert_eq!((step, what.to_lowercase().as_str()), (4, name.to_lowercase().as_str()));
+        assert!(dataset.views.iter().any(|known| known.name == view), "{view}");
+        assert!(trainer.gaussians().unwrap() == before && trainer.steps_done() == 3, "{name}");
     }
 }
 

@@ -419,14 +419,14 @@ fn gaussians_of_another_shape_or_storage_are_refused() {
     let gpu = gpu();
     let setup = Setup::new(10, [32, 24], Shape { sh_degree: 1, features: features(4) }, 1);
     let settings = |shape: Shape, rest| RenderSettings { shape, rest, ..setup.settings };
-    let own = setup.settings.shape;
+    let given = setup.settings.shape;
     for (settings, why) in [
-        (settings(own, StorageFormat::Half), "SH coefficients as Single"),
+        (settings(given, StorageFormat::Half), "SH coefficients as Single"),
         (
             settings(0.into(), StorageFormat::Single),
             "Gaussians of SH degree 1 with depth cannot be rendered by a renderer made for SH degree 0",
         ),
-        (settings(Shape { sh_degree: 3, ..own }, StorageFormat::Single), "made for SH degree 3"),
+        (settings(Shape { sh_degree: 3, ..given }, StorageFormat::Single), "made for SH degree 3"),
     ] {
         let mut renderer = Renderer::new(&gpu, settings).unwrap();
         renderer.reserve(setup.count, [&setup.camera]).unwrap();

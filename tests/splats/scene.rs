@@ -117,8 +117,8 @@ mod from_points {
         let normal = DVec3::new(1.0, 2.0, -2.0) / 3.0;
         let (right, up) =
             (normal.any_orthonormal_vector(), normal.cross(normal.any_orthonormal_vector()));
-        let place = |i: i32| DVec3::ONE + right * f64::from(i % 9) + up * f64::from(i / 9);
-        let positions: Vec<DVec3> = (0..81).map(place).collect();
+        let position = |i: i32| DVec3::ONE + right * f64::from(i % 9) + up * f64::from(i / 9);
+        let positions: Vec<DVec3> = (0..81).map(position).collect();
         let colors = vec![Vec3::ONE; positions.len()];
         let start = Initialization { opacity: 0.3, scale: 0.5, min_axis_ratio: 0.2 };
         let gaussians = Gaussians::from_points(&positions, &colors, 0, &start, 0).unwrap();

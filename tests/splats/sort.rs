@@ -65,7 +65,7 @@ fn assert_sorts(gpu: &Gpu, sort: &mut RadixSort, what: &str, keys: &[u32], count
 #[test]
 fn sorts_of_all_sizes_are_correct_and_stable() {
     for is_cpu in [true, false] {
-        let gpu = gpu_with(|own| own.is_cpu = is_cpu);
+        let gpu = gpu_with(|properties| properties.is_cpu = is_cpu);
         let mut sort = RadixSort::new(&gpu, 0).unwrap();
         for size in SIZES {
             let keys = noise(size);
@@ -79,7 +79,7 @@ fn sorts_of_all_sizes_are_correct_and_stable() {
 #[test]
 fn a_sort_by_any_number_of_bits_uses_only_those_bits() {
     for is_cpu in [true, false] {
-        let gpu = gpu_with(|own| own.is_cpu = is_cpu);
+        let gpu = gpu_with(|properties| properties.is_cpu = is_cpu);
         let mut sort = RadixSort::new(&gpu, 9000).unwrap();
         let keys = noise(9000);
         for bits in [0, 1, 7, 8, 9, 13, 16, 17, 24, 31] {
@@ -104,7 +104,7 @@ fn equal_and_extreme_keys_keep_their_order() {
 #[test]
 fn a_sort_reads_its_count_on_the_device_and_stays_within_the_buffers() {
     for is_cpu in [true, false] {
-        let gpu = gpu_with(|own| own.is_cpu = is_cpu);
+        let gpu = gpu_with(|properties| properties.is_cpu = is_cpu);
         let mut sort = RadixSort::new(&gpu, 9000).unwrap();
         let keys = noise(9000);
         // A larger count after a smaller one meets the tables that the smaller one left.
@@ -117,7 +117,7 @@ fn a_sort_reads_its_count_on_the_device_and_stays_within_the_buffers() {
 #[test]
 fn twenty_five_sorts_are_identical() {
     for is_cpu in [true, false] {
-        let gpu = gpu_with(|own| own.is_cpu = is_cpu);
+        let gpu = gpu_with(|properties| properties.is_cpu = is_cpu);
         let mut sort = RadixSort::new(&gpu, 20_000).unwrap();
         // Few distinct keys: a race between equal ones would change the values.
         let keys: Vec<u32> = noise(20_000).iter().map(|n| n % 37 * 0x10_0001).collect();

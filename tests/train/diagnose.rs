@@ -39,7 +39,7 @@ fn load(folder: &Path) -> (Dataset, LoadOptions) {
 
 fn diagnosis_of(folder: &Path) -> Diagnosis {
     let (dataset, options) = load(folder);
-    Diagnosis::of(&dataset, &options).unwrap()
+    Diagnosis::new(&dataset, &options).unwrap()
 }
 
 fn plan_of(folder: &Path) -> Plan {
@@ -168,7 +168,7 @@ fn a_blurred_photograph_and_one_without_a_pose_are_named() {
     let found = diagnosis_of(set.path());
     assert_eq!(found.without_pose, ["stray"]);
     for remark in ["more blurred than the others: 003", "without a pose, not used: stray"] {
-        assert!(found.remarks.iter().any(|own| own.contains(remark)), "{:?}", found.remarks);
+        assert!(found.remarks.iter().any(|text| text.contains(remark)), "{:?}", found.remarks);
     }
     let view = |name: &str| found.views.iter().find(|view| view.name == name).unwrap();
     assert!(view("003").blur > view("002").blur);

@@ -38,7 +38,7 @@ fn frozen_geometry_keeps_its_bits_and_colours_learn_on_any_device() {
     let folder = tempfile::tempdir().unwrap();
     let (path, day) = day(&folder);
     let dataset = dataset(6, [40, 30]);
-    for gpu in [gpu(), gpu_with(|own| own.is_cpu = false)] {
+    for gpu in [gpu(), gpu_with(|properties| properties.is_cpu = false)] {
         for format in [StorageFormat::Single, StorageFormat::Half] {
             let mut config = config(path.clone(), GEOMETRY);
             (config.precision.rest, config.precision.moments) = (format, format);
@@ -66,7 +66,7 @@ fn frozen_geometry_keeps_its_bits_and_colours_learn_on_any_device() {
             assert!(before.dc() != after.dc() && before.rest() != after.rest());
             assert!(loss(24..39) < loss(0..15), "{} {}", loss(24..39), loss(0..15));
             let gradients = trainer.gradients().unwrap();
-            assert!(gradients.means().iter().all(|own| *own == glam::Vec3::ZERO), "not written");
+            assert!(gradients.means().iter().all(|mean| *mean == glam::Vec3::ZERO), "not written");
         }
     }
 }
@@ -81,7 +81,8 @@ fn frozen_geometry_in_batches_gives_the_bits_of_one_batch_and_resumes() {
     random.start.scale = 0.1;
     let path = folder.path().join("day.ply");
     train(&random, &dataset).1.save(&path).unwrap();
-    let (whole, little) = (gpu(), gpu_with(|own| own.max_storage_buffer_range = 1 << 19));
+    let (whole, little) =
+        (gpu(), gpu_with(|properties| properties.max_storage_buffer_range = 1 << 19));
     let new = |gpu: &Gpu| {
         let mut config = config(path.clone(), GEOMETRY);
         config.tile = Some([16, 16].into());

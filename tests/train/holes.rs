@@ -132,13 +132,13 @@ fn masked_pixels_are_not_holes() {
     assert!(!empty.is_empty() && !covered.is_empty());
     let masked = |hidden: &[usize]| {
         let mask = Mask::hiding(&rendered.colors, hidden);
-        ResidualTransmittance::of(&rendered, &View { mask, ..view.clone() })
+        ResidualTransmittance::measure(&rendered, &View { mask, ..view.clone() })
     };
     assert!(masked(&[]).unwrap().q99 > 0.9, "{:?}", masked(&[]));
     assert!(masked(&empty).unwrap().q99 <= 0.5 && masked(&covered).unwrap().mean > 0.5);
     assert_eq!(masked(&[empty, covered].concat()), None);
     // An image that was not rendered from Gaussians has none.
-    assert_eq!(ResidualTransmittance::of(&rendered.colors.clone().into(), view), None);
+    assert_eq!(ResidualTransmittance::measure(&rendered.colors.clone().into(), view), None);
 }
 
 #[test]
@@ -153,9 +153,10 @@ fn a_denoiser_and_patches_do_not_change_the_transmittances() {
     let (model, plain) = (trainer.model().unwrap(), TrainConfig::bare());
     let mut model_renderer = ModelRenderer::new(&gpu(), &model, &plain, None).unwrap();
     let whole = model_renderer.render(view).unwrap();
-    let [in_parts, whole] = [rendered, whole].map(|own| own.transmittances.unwrap());
+    let [in_parts, whole] =
+        [rendered, whole].map(|rendered_image| rendered_image.transmittances.unwrap());
     assert_eq!(in_parts.len(), 64 * 48);
-    let far = in_parts.iter().zip(&whole).filter(|(own, whole)| (*own - *whole).abs() > 1e-3);
+    let far = in_parts.iter().zip(&whole).filter(|(part, whole)| (*part - *whole).abs() > 1e-3);
     assert!(far.count() < 10 && whole.iter().any(|&open| open < 0.5));
 }
 

@@ -43,17 +43,21 @@ fn lamp() -> Lamp {
 fn walls() -> (Vec<DVec3>, Vec<Vec3>) {
     let draws = Stream::new(7, 1);
     let number = |i: u64, k: u64| draws.uniform(6 * i + k);
-    let place = |i: u64| {
+    let workspace = |i: u64| {
         let inside = DVec3::new(number(i, 0), number(i, 1), number(i, 2)) * 2.0 - 1.0;
         let (wall, side) = ((number(i, 3) * 2.4) as usize, 2.0 * (i % 2) as f64 - 1.0);
-        let mut place = inside * HALF;
-        place[wall] = side * HALF[wall];
-        place
+        let mut workspace = inside * HALF;
+        workspace[wall] = side * HALF[wall];
+        workspace
     };
-    let places: Vec<DVec3> = (0..1500).map(place).collect();
-    let tint = |place: &DVec3| {
+    let places: Vec<DVec3> = (0..1500).map(workspace).collect();
+    let tint = |workspace: &DVec3| {
         let wave = |at: f64| (0.55 + 0.35 * (3.0 * at).sin()) as f32;
-        Vec3::new(wave(place.x + place.z), wave(place.y - place.z), wave(place.x - place.y))
+        Vec3::new(
+            wave(workspace.x + workspace.z),
+            wave(workspace.y - workspace.z),
+            wave(workspace.x - workspace.y),
+        )
     };
     let colors = places.iter().map(tint).collect();
     (places, colors)
@@ -64,7 +68,7 @@ fn camera(view: usize) -> Camera {
     let draws = Stream::new(9, 2);
     let number = |k: u64| 2.0 * draws.uniform(4 * view as u64 + k) - 1.0;
     let along = if view.is_multiple_of(2) { 0.0 } else { std::f64::consts::PI };
-    let place = DVec3::new(0.4 * number(0), 0.3 * number(1), 2.8 * number(2));
+    let workspace = DVec3::new(0.4 * number(0), 0.3 * number(1), 2.8 * number(2));
     let turn = DMat3::from_rotation_y(along + 0.6 * number(3));
     let rotation = turn.transpose();
     Camera {
@@ -73,7 +77,7 @@ fn camera(view: usize) -> Camera {
         focal: DVec2::splat(44.0),
         principal_point: DVec2::new(32.0, 24.0),
         model: CameraModel::Pinhole,
-        view_from_world: DAffine3 { matrix3: rotation, translation: -(rotation * place) },
+        view_from_world: DAffine3 { matrix3: rotation, translation: -(rotation * workspace) },
     }
 }
 
@@ -101,10 +105,10 @@ fn photographed() -> (Dataset, Vec<Image>) {
     };
     let views: Vec<View> = lit.into_iter().enumerate().map(view).collect();
     // Those that see a point are near it: the others see a wall before it.
-    let is_near = |view: &View, place: DVec3| view.camera.center().distance(place) < 3.0;
-    let seen = |place: DVec3| {
+    let is_near = |view: &View, workspace: DVec3| view.camera.center().distance(workspace) < 3.0;
+    let seen = |workspace: DVec3| {
         let sees = |(index, view): (usize, &View)| {
-            let is_seen = view.camera.sees(place).is_some() && is_near(view, place);
+            let is_seen = view.camera.sees(workspace).is_some() && is_near(view, workspace);
             is_seen.then_some(index as u32)
         };
         views.iter().enumerate().filter_map(sees).collect()
@@ -134,16 +138,16 @@ fn scores(trainer: &mut Trainer, dataset: &Dataset, even: &[Image]) -> [f64; 2] 
     let (mut sums, mut count) = ([0.0; 2], 0.0);
     let mut products = [0.0_f32; 2];
     for (view, even) in dataset.views.iter().zip(even).filter(|(view, _)| view.is_train()) {
-        let own = trainer.render_in_even_light(&view.camera).unwrap().colors;
-        for (own, even) in own.data.iter().zip(&even.data) {
-            products = [products[0] + own * even, products[1] + own * own];
+        let rendered = trainer.render_in_even_light(&view.camera).unwrap().colors;
+        for (rendered, even) in rendered.data.iter().zip(&even.data) {
+            products = [products[0] + rendered * even, products[1] + rendered * rendered];
         }
     }
     let gain = products[0] / products[1];
     for (view, even) in dataset.views.iter().zip(even).filter(|(view, _)| !view.is_train()) {
         let lit = trainer.render(&view.camera).unwrap().colors;
         let evenly = trainer.render_in_even_light(&view.camera).unwrap().colors;
-        let psnr = |a: &Image, b: &Image| Scores::of(a, b).unwrap().psnr;
+        let psnr = |a: &Image, b: &Image| Scores::measure(a, b).unwrap().psnr;
         sums[0] += psnr(&lit, view.image.as_ref().unwrap());
         sums[1] +=
             psnr(&Image { data: evenly.data.iter().map(|x| gain * x).collect(), ..evenly }, even);
@@ -170,11 +174,14 @@ fn a_lamp_is_told_from_the_surfaces_that_it_lights() {
     assert!(lit > plain[0] + 2.0, "without a lamp {:.2} dB", plain[0]);
     assert_eq!(without.lamp().unwrap(), None);
     // The light along the axis and across it, up to the reference distances of both and the slope of the tone curve.
-    let own = with.lamp().unwrap().unwrap();
+    let trained = with.lamp().unwrap().unwrap();
     let ratio = |lamp: &Lamp, point: DVec3| lamp.factor(point) / lamp.factor(1.5 * DVec3::Z);
     for point in [DVec3::Z, 3.0 * DVec3::Z, DVec3::new(0.7, 0.0, 1.2)] {
-        let [own, planted] = [&own, &lamp()].map(|lamp| ratio(lamp, point));
-        assert!((own / planted).ln().abs() < 0.2, "{point}: {own:.3}, planted {planted:.3}");
+        let [trained, planted] = [&trained, &lamp()].map(|lamp| ratio(lamp, point));
+        assert!(
+            (trained / planted).ln().abs() < 0.2,
+            "{point}: {trained:.3}, planted {planted:.3}"
+        );
     }
 }
 
@@ -193,7 +200,7 @@ fn a_lamp_that_is_not_there_does_not_hurt() {
         advance(&mut trainer, config.steps);
         let psnr = |view: &View| {
             let shown = trainer.render(&view.camera).unwrap().colors;
-            Scores::of(&shown, &view.loaded_reference().unwrap().unwrap()).unwrap().psnr
+            Scores::measure(&shown, &view.loaded_reference().unwrap().unwrap()).unwrap().psnr
         };
         let scores: Vec<f64> = dataset.test_views().map(psnr).collect();
         scores.iter().sum::<f64>() / scores.len() as f64
@@ -209,17 +216,17 @@ fn metrics(run: &Path) -> Value {
 #[test]
 fn a_run_keeps_its_lamp_for_scores_and_for_a_flight_that_carries_it() {
     let folder = tempfile::tempdir().unwrap();
-    let [set, own] = ["set", "run"].map(|name| folder.path().join(name));
+    let [set, run] = ["set", "run"].map(|name| folder.path().join(name));
     let options =
         SyntheticOptions { views: 9, width: 40, height: 30, seed: 2, ..Default::default() };
     synthetic::write(&set, &options).unwrap();
-    let [set_name, run_name] = [&set, &own].map(|path| path.display().to_string());
+    let [set_name, run_name] = [&set, &run].map(|path| path.display().to_string());
     succeed(&format!(
         "train {set_name} --parts lamp --steps 30 --out {run_name} --set lamp.ambient=0"
     ));
-    let lamp: Value = serde_json::from_slice(&fs::read(own.join("lamp.json")).unwrap()).unwrap();
+    let lamp: Value = serde_json::from_slice(&fs::read(run.join("lamp.json")).unwrap()).unwrap();
     assert!(lamp["reference_distance"].as_f64().unwrap() > 0.1, "{lamp}");
-    let config = fs::read_to_string(own.join("config.toml")).unwrap();
+    let config = fs::read_to_string(run.join("config.toml")).unwrap();
     let gain = config.lines().find(|line| line.starts_with("scene_statistics")).unwrap();
     assert!(gain.contains("true") && gain.contains("the part lamp"), "{gain}");
 
@@ -228,7 +235,7 @@ fn a_run_keeps_its_lamp_for_scores_and_for_a_flight_that_carries_it() {
     };
     let lit = eval("");
     let psnr = |metrics: &Value| metrics["mean"]["psnr"].as_f64().unwrap();
-    assert!((psnr(&lit) - psnr(&metrics(&own))).abs() < 1e-3);
+    assert!((psnr(&lit) - psnr(&metrics(&run))).abs() < 1e-3);
     assert!(lit["lit_by_lamp"].is_null());
     let [evenly, carried] = ["evenly", "carried"].map(|name| folder.path().join(name));
     let out = evenly.display();
@@ -256,7 +263,7 @@ fn a_run_keeps_its_lamp_for_scores_and_for_a_flight_that_carries_it() {
     let pictures = folder.path().join("none");
     let flight = format!("render {out} --split test --lamp --out {}", pictures.display());
     refused(&flight, 3, &["has no lamp", "leave out --lamp"]);
-    fs::write(own.join("lamp.json"), "{\"exponent\": 9}").unwrap();
+    fs::write(run.join("lamp.json"), "{\"exponent\": 9}").unwrap();
     refused(&format!("eval {run_name}"), 3, &["lamp.json", "is not a lamp"]);
 }
 

@@ -29,7 +29,7 @@ fn written(options: &SyntheticOptions, capture: &Capture) -> tempfile::TempDir {
 
 fn diagnosis(folder: &Path) -> Diagnosis {
     let options = LoadOptions::default();
-    Diagnosis::of(&Dataset::load(folder, &options).unwrap(), &options).unwrap()
+    Diagnosis::new(&Dataset::load(folder, &options).unwrap(), &options).unwrap()
 }
 
 fn scene(folder: &Path) -> SceneDiagnosis {

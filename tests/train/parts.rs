@@ -153,8 +153,8 @@ fn the_illumination_is_initialised_from_the_photographs_and_their_targets() {
         train(&config, &load(folder.path(), &config)).0[0].term(Term::LOW_L1)
     };
     let parts = [Part::Tonemapper];
-    let (own, of_paper) = (first(&config(&parts)), first(&paper(&parts)));
-    assert!(own < of_paper, "{own}, and {of_paper} in the paper");
+    let (of_targets, of_paper) = (first(&config(&parts)), first(&paper(&parts)));
+    assert!(of_targets < of_paper, "{of_targets}, and {of_paper} in the paper");
 }
 
 #[test]

@@ -14,9 +14,9 @@ use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, R
 use nightsplat::train::{Part, Rendered, TrainConfig, Trainer};
 
 use crate::common::command::{command, refused, succeed};
-use crate::common::place::Place;
 use crate::common::setup::{Setup, features};
 use crate::common::train::advance;
+use crate::common::workspace::Workspace;
 use crate::common::{Random, not_run};
 
 /// Gaussians of every kind in a view of several patches; some are far outside it.
@@ -84,8 +84,8 @@ fn gradients(setup: &Setup, weights: &[f32]) -> [Vec<f32>; 3] {
             )
         })
         .unwrap();
-        for (sum, own) in sums.iter_mut().zip(gpu.read(&parameters).unwrap()) {
-            *sum += share * own;
+        for (sum, gradient) in sums.iter_mut().zip(gpu.read(&parameters).unwrap()) {
+            *sum += share * gradient;
         }
     }
     let visits: Vec<u32> = gpu.read(&visit_counts).unwrap();
@@ -115,8 +115,8 @@ fn the_gradients_of_the_patches_add_up_to_that_of_the_view() {
     let alone: Vec<usize> = alone.collect();
     assert!(alone.len() > whole.count / 4);
     for i in alone {
-        let (own, norm) = (own_norms[i], norms[i]);
-        assert!((own - norm).abs() <= 1e-2 * norm + 1e-3, "{i}: {own} instead of {norm}");
+        let (sum, norm) = (own_norms[i], norms[i]);
+        assert!((sum - norm).abs() <= 1e-2 * norm + 1e-3, "{i}: {sum} instead of {norm}");
     }
 }
 
@@ -154,11 +154,11 @@ fn training_starts_as_with_whole_views_and_uses_every_patch_of_every_photograph_
         advance(&mut trainer, config.steps);
         let view = dataset.test_views().next().unwrap();
         let shown = trainer.render(&view.camera).unwrap().colors;
-        Scores::of(&shown, view.reference.as_ref().unwrap()).unwrap().psnr
+        Scores::measure(&shown, view.reference.as_ref().unwrap()).unwrap().psnr
     };
     let expected = psnr(TrainConfig { steps: 60, ..config(None) });
-    let own = psnr(TrainConfig { steps: 240, ..config(Some(800)) });
-    assert!(own > expected - 0.5, "{own} dB, whole views {expected} dB");
+    let patched = psnr(TrainConfig { steps: 240, ..config(Some(800)) });
+    assert!(patched > expected - 0.5, "{patched} dB, whole views {expected} dB");
 }
 
 #[test]
@@ -225,30 +225,30 @@ fn a_denoiser_reads_around_each_patch() {
 
 #[test]
 fn a_run_on_patches_is_reported_resumed_to_the_same_bits_and_scored() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let output =
-        command(&place.train("straight", "--steps 30 --patch-pixels 600")).output().unwrap();
+        command(&workspace.train("straight", "--steps 30 --patch-pixels 600")).output().unwrap();
     let message = String::from_utf8_lossy(&output.stderr);
     assert!(message.contains("40x30, in 2 of about 20x30"), "{message}");
-    let config = String::from_utf8(place.read("straight/config.toml")).unwrap();
+    let config = String::from_utf8(workspace.read("straight/config.toml")).unwrap();
     assert!(config.contains("patch_pixels = 600"));
     let stopped = "--steps 30 --patch-pixels 600 --hash-every 7 --max-minutes 1e-7";
-    let output = command(&place.train("run", stopped)).output().unwrap();
+    let output = command(&workspace.train("run", stopped)).output().unwrap();
     assert_eq!(output.status.code(), Some(75));
-    succeed(&place.train("run", "--steps 30 --patch-pixels 600 --resume"));
-    assert!(place.model("run") == place.model("straight"));
+    succeed(&workspace.train("run", "--steps 30 --patch-pixels 600 --resume"));
+    assert!(workspace.model("run") == workspace.model("straight"));
     assert!(
-        place.model("straight") != {
-            succeed(&place.train("whole", "--steps 30"));
-            place.model("whole")
+        workspace.model("straight") != {
+            succeed(&workspace.train("whole", "--steps 30"));
+            workspace.model("whole")
         }
     );
     refused(
-        &place.train("few", "--patch-pixels 255"),
+        &workspace.train("few", "--patch-pixels 255"),
         2,
         &["patch_pixels (--patch-pixels) is 255", "256"],
     );
-    assert!(!fs::exists(place.path("few")).unwrap());
+    assert!(!fs::exists(workspace.path("few")).unwrap());
 }
 
 /// `count` Gaussians that each cover a view of this size.
@@ -266,38 +266,38 @@ fn covering(count: usize, size: [u32; 2]) -> Setup {
 
 #[test]
 fn more_intersections_than_the_device_binds_are_rendered_in_halves() {
-    let own = covering(300, [1440, 1280]);
-    let mut renderer = renderer(&own);
+    let setup = covering(300, [1440, 1280]);
+    let mut renderer = renderer(&setup);
     let most = renderer.max_intersections();
     if most > 1 << 22 {
         return not_run("lavapipe", format_args!("this device binds {most} intersections at once"));
     }
-    let gaussians = own.upload();
-    let shown = renderer.render_channels(&gaussians, &own.camera, &own.options).unwrap();
+    let gaussians = setup.upload();
+    let shown = renderer.render_channels(&gaussians, &setup.camera, &setup.options).unwrap();
     assert!(renderer.intersections().unwrap() > most / 3, "the last was no half");
-    let mut parted = own.clone();
+    let mut parted = setup.clone();
     parted.settings.patch_pixels = Some(1 << 18);
     let mut renderer = self::renderer(&parted);
-    let expected = renderer.render_channels(&gaussians, &own.camera, &own.options).unwrap();
+    let expected = renderer.render_channels(&gaussians, &setup.camera, &setup.options).unwrap();
     let errors = shown.iter().zip(&expected).map(|(shown, expected)| (shown - expected).abs());
     assert!(errors.fold(0.0, f32::max) < 1e-3);
 }
 
 #[test]
 fn training_uses_patches_whose_intersections_the_device_can_process() {
-    let own = covering(300, [1440, 1280]);
-    if renderer(&own).max_intersections() > 1 << 22 {
+    let setup = covering(300, [1440, 1280]);
+    if renderer(&setup).max_intersections() > 1 << 22 {
         return not_run("lavapipe", "this device binds more intersections at once");
     }
     let dark = Image::filled(1440, 1280, [0.1; 3]);
-    let view = |name| View::new(name, Split::Train, own.camera, Some(dark.clone()));
+    let view = |name| View::new(name, Split::Train, setup.camera, Some(dark.clone()));
     let dataset = Dataset {
         root: ".".into(),
         views: vec![view("a"), view("b")],
         points: vec![],
         skipped: vec![],
     };
-    let gaussians = own.gaussians();
+    let gaussians = setup.gaussians();
     let mut config = TrainConfig { steps: 8, sh_degree: 0, ..config(None) };
     config.frame = Some(TrainingFrame::WORLD);
     config.schedule.resolution_steps = [0, 0];

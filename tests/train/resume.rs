@@ -16,8 +16,8 @@ use nightsplat::train::{Background, EndReason, Part, StepReport, TrainConfig, Tr
 use safetensors::SafeTensors;
 
 use crate::common::command::{command, refused, succeed};
-use crate::common::place::log;
 use crate::common::train::{advance, small_set};
+use crate::common::workspace::log;
 
 /// A dataset of nine small views.
 fn make_set(folder: &Path) {

@@ -58,7 +58,7 @@ fn a_model_learns_to_show_the_scene_in_normal_light() {
     let dark: Vec<Scores> = dataset
         .test_views()
         .map(|view| {
-            Scores::of(view.image.as_ref().unwrap(), view.reference.as_ref().unwrap()).unwrap()
+            Scores::measure(view.image.as_ref().unwrap(), view.reference.as_ref().unwrap()).unwrap()
         })
         .collect();
     let (dark, lit) = (Scores::mean(&dark).unwrap().psnr, mean_psnr(&dataset, &gaussians));
@@ -179,7 +179,7 @@ fn who_specializes_the_kernels_changes_no_bit() {
         advance(&mut trainer, 20);
         trainer.gaussians().unwrap()
     };
-    assert_eq!(train(&gpu_with(|own| own.driver_specializes = true)), train(&gpu()));
+    assert_eq!(train(&gpu_with(|properties| properties.driver_specializes = true)), train(&gpu()));
 }
 
 /// Systems reset a device whose submission takes seconds.
@@ -217,8 +217,8 @@ fn a_plain_step_is_at_most_18_dispatches_and_barriers_on_a_gpu_and_in_small_view
     let large = [320, 240];
     for (gpu, size, most) in [
         (cpu, [64, 48], [18, 16]),
-        (gpu_with(|own| own.is_cpu = false), [64, 48], [16, 15]),
-        (gpu_with(|own| own.is_cpu = false), large, [17, 16]),
+        (gpu_with(|properties| properties.is_cpu = false), [64, 48], [16, 15]),
+        (gpu_with(|properties| properties.is_cpu = false), large, [17, 16]),
     ] {
         let dataset = crate::common::train::dataset(4, size);
         for (bits, more) in [(StorageFormat::Single, 0), (StorageFormat::Half, 1)] {

@@ -48,7 +48,7 @@ impl Device {
             let has_push_descriptors = instance
                 .enumerate_device_extension_properties(physical)?
                 .iter()
-                .any(|own| own.extension_name_as_c_str() == Ok(khr::push_descriptor::NAME));
+                .any(|offered| offered.extension_name_as_c_str() == Ok(khr::push_descriptor::NAME));
             let queues = [vk::DeviceQueueCreateInfo::default()
                 .queue_family_index(family)
                 .queue_priorities(&[1.0])];

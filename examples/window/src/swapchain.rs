@@ -60,7 +60,7 @@ impl Swapchain {
                 true => [vk::Format::B8G8R8A8_SRGB, vk::Format::R8G8B8A8_SRGB],
                 false => [vk::Format::B8G8R8A8_UNORM, vk::Format::R8G8B8A8_UNORM],
             };
-            let format = formats.iter().find(|own| wanted.contains(&own.format));
+            let format = formats.iter().find(|offered| wanted.contains(&offered.format));
             let format = format.ok_or("the window has no images of 8 bits")?;
             let most = if able.max_image_count == 0 { u32::MAX } else { able.max_image_count };
             let info = vk::SwapchainCreateInfoKHR::default()
@@ -75,7 +75,7 @@ impl Swapchain {
                 .composite_alpha(vk::CompositeAlphaFlagsKHR::OPAQUE)
                 .present_mode(vk::PresentModeKHR::FIFO)
                 .clipped(true)
-                .old_swapchain(former.as_ref().map_or_else(Default::default, |own| own.raw));
+                .old_swapchain(former.as_ref().map_or_else(Default::default, |former_chain| former_chain.raw));
             let swapchain = swapchains.create_swapchain(&info, None)?;
             if let Some(former) = former {
                 former.destroy(device);

@@ -22,17 +22,17 @@ layout(binding = 0) readonly  buffer Partials  { vec2 partials[]; };    // (3, c
 layout(binding = 1) writeonly buffer Gradients { float gradients[]; };  // (views, EXPOSURE_WIDTH)
 
 void main() {
-    uint own = view * EXPOSURE_WIDTH;
+    uint begin = view * EXPOSURE_WIDTH;
     for (uint i = gl_SubgroupInvocationID; i < view_count * EXPOSURE_WIDTH; i += SUBGROUP_SIZE)
-        if (i < own || i >= own + EXPOSURE_WIDTH) gradients[i] = 0.0;
+        if (i < begin || i >= begin + EXPOSURE_WIDTH) gradients[i] = 0.0;
     for (uint channel = 0; channel < 3; ++channel) {
         vec2 sums = vec2(0.0);
         for (uint k = gl_SubgroupInvocationID; k < chunk_count; k += SUBGROUP_SIZE)
             sums += partials[channel * chunk_count + k];
         sums = subgroup_sum(sums);
         if (subgroupElect()) {
-            gradients[own + channel] = sums.x;
-            gradients[own + channel + 3] = BIAS_SCALE * sums.y;
+            gradients[begin + channel] = sums.x;
+            gradients[begin + channel + 3] = BIAS_SCALE * sums.y;
         }
     }
 }

@@ -45,9 +45,9 @@ bool is_small(uint i) {
 }
 
 void main() {
-    uint place = THREAD_INDEX;
-    if (place >= gaussian_count) return;
-    uint i = sorted_ids[place], key = sorted_keys[place];
+    uint rank = THREAD_INDEX;
+    if (rank >= gaussian_count) return;
+    uint i = sorted_ids[rank], key = sorted_keys[rank];
     // Unsigned: Gaussians before the batch wrap beyond its end.
     if (i - first_gaussian >= batch_count) return;
     uint first_without = available();

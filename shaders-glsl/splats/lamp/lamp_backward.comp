@@ -39,7 +39,7 @@ void main() {
     uint chunk = WORKGROUP_INDEX;
     if (chunk * CHUNK >= gaussian_count) return;
     uint end = min((chunk + 1) * CHUNK, gaussian_count);
-    Lamp own = load_lamp();
+    Lamp loaded = load_lamp();
     float sums[LAMP_WIDTH];
     [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) sums[n] = 0.0;
     for (uint i = chunk * CHUNK + gl_SubgroupInvocationID; i < end; i += SUBGROUP_SIZE) {
@@ -47,14 +47,14 @@ void main() {
         vec3 d_dc = vec3(gradients[dc], gradients[dc + 1], gradients[dc + 2]);
         if (d_dc == vec3(0.0)) continue;
         vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
-        LampPoint at = lamp_at(own, cameras[camera_index].view_from_world * vec4(mean, 1.0));
-        float factor = lamp_factor(own, at), d = 0.0;
+        LampPoint at = lamp_at(loaded, cameras[camera_index].view_from_world * vec4(mean, 1.0));
+        float factor = lamp_factor(loaded, at), d = 0.0;
         for (uint c = 0; c < 3; c++) {
-            float x = lamp_tone_inverse(own, colors[COLOR_VECTORS * i][c] - own.black) / factor;
-            d += d_dc[c] / SH_C0 * x * lamp_tone_slope(own, x);
+            float x = lamp_tone_inverse(loaded, colors[COLOR_VECTORS * i][c] - loaded.black) / factor;
+            d += d_dc[c] / SH_C0 * x * lamp_tone_slope(loaded, x);
         }
         float gradient[LAMP_WIDTH];
-        lamp_gradient(own, at, gradient);
+        lamp_gradient(loaded, at, gradient);
         [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) sums[n] += d * gradient[n];
     }
     [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) {

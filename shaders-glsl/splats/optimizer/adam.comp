@@ -45,16 +45,16 @@ vec4 rates_at(uvec4 i) {
 
 void main() {
     uint begin = FROZEN_COLUMNS * gaussian_count;
-    uint own = THREAD_INDEX, quad = frozen_quads() + own;
+    uint trained = THREAD_INDEX, quad = frozen_quads() + trained;
     uint end = column_count * gaussian_count;
     if (4 * quad >= end || status[0] != 0) return;
     uvec4 i = 4 * quad + uvec4(0, 1, 2, 3);
     // The first and the last quad can extend into a column that is not updated. Unsigned: before `begin`, it wraps.
     bvec4 takes_part = lessThan(i - begin, uvec4(end - begin));
-    vec4 gradient = clamp_gradient(gradients[own]);
+    vec4 gradient = clamp_gradient(gradients[trained]);
     Moments moments;
-    if (HALF_MOMENTS) moments = from_halves(both_moments[own]);
-    else moments = Moments(first_moments[own], second_moments[own]);
+    if (HALF_MOMENTS) moments = from_halves(both_moments[trained]);
+    else moments = Moments(first_moments[trained], second_moments[trained]);
     moments = updated(moments, gradient);
     if (HALF_MOMENTS) moments = flushed(moments);
     vec4 before = parameters[quad];
@@ -66,9 +66,9 @@ void main() {
     if (HALF_MOMENTS) {
         // As integers: a device may flush a float whose bits are those of a second moment alone.
         uvec4 halves = in_halves(moments, chance_of(before, moments, step));
-        both_moments[own] = mix(both_moments[own], halves, takes_part);
+        both_moments[trained] = mix(both_moments[trained], halves, takes_part);
     } else {
-        first_moments[own] = mix(first_moments[own], moments.first, takes_part);
-        second_moments[own] = mix(second_moments[own], moments.second, takes_part);
+        first_moments[trained] = mix(first_moments[trained], moments.first, takes_part);
+        second_moments[trained] = mix(second_moments[trained], moments.second, takes_part);
     }
 }

@@ -44,10 +44,10 @@ layout(binding = 5) readonly  buffer Cameras       { Camera cameras[]; };
 void update(uvec4 at, uint count, vec4 gradient, vec4 rate, bool is_log_scale) {
     vec4 value, first, second;
     [[unroll]] for (uint k = 0; k < 4; k++) {
-        uint own = k < count ? at[k] : at[0];
-        value[k] = parameters[own];
-        first[k] = first_moments[trained_place(own)];
-        second[k] = second_moments[trained_place(own)];
+        uint index = k < count ? at[k] : at[0];
+        value[k] = parameters[index];
+        first[k] = first_moments[trained_place(index)];
+        second[k] = second_moments[trained_place(index)];
     }
     Moments moments = updated(Moments(first, second), clamp_gradient(gradient));
     value -= adam_step(moments, rate, second_correction);

@@ -39,8 +39,8 @@ void main() {
         vec3 mean_in_view = camera.view_from_world * vec4(mean, 1.0);
         float depth = camera_depth(mean_in_view, camera);
         if (!(depth > near)) continue;
-        vec2 place = camera_project(mean_in_view, camera) / vec2(camera.size) - 0.5;
-        if (all(lessThanEqual(abs(place), vec2(0.5 + SEEN_MARGIN))))
+        vec2 position = camera_project(mean_in_view, camera) / vec2(camera.size) - 0.5;
+        if (all(lessThanEqual(abs(position), vec2(0.5 + SEEN_MARGIN))))
             sampling = min(sampling, depth / max(camera.focal.x, camera.focal.y));
     }
     if (!(sampling < 1e30)) return;

@@ -51,9 +51,9 @@ void main() {
         [[unroll]] for (uint k = 0; k < AHEAD; k++) count[k] = tile_counts[count[k]];
         [[unroll]] for (uint k = 0; k < AHEAD; k++) {
             uint rank = first + k * SUBGROUP_SIZE + lane;
-            uint own = rank < end ? count[k] : 0;
-            uint inclusive = subgroup_inclusive_sum(own);
-            if (rank < end) intersection_offsets[rank] = sum + inclusive - own;
+            uint counted = rank < end ? count[k] : 0;
+            uint inclusive = subgroup_inclusive_sum(counted);
+            if (rank < end) intersection_offsets[rank] = sum + inclusive - counted;
             sum += subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
         }
     }

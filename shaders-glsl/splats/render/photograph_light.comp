@@ -65,8 +65,8 @@ vec2 solved(float value, float factor, float t) {
     float share = tone.constants[0];
     float slope = 1.0;
     for (uint trial = 0; trial < TRIALS; ++trial) {
-        float own = (1.0 - share) * one_minus_exp(t) + share * (t * factor);
-        float y = tone.offset + (1.0 - tone.offset) * own;
+        float toe = (1.0 - share) * one_minus_exp(t) + share * (t * factor);
+        float y = tone.offset + (1.0 - tone.offset) * toe;
         slope = (1.0 - tone.offset) * ((1.0 - share) * exp(-t) + share * factor);
         if (tone.weight < 1.0) {
             float x = t * tone.white;
@@ -105,9 +105,9 @@ vec3 automatic(vec3 value) {
         vec2 factor = factor_at(y);
         float rise = 0.0;
         for (uint channel = 0; channel < 3; ++channel) {
-            vec2 own = solved(value[channel], factor.x, t[channel]);
-            t[channel] = own.x;
-            rise -= WEIGHTS[channel] * share * own.x * factor.y / own.y;
+            vec2 solution = solved(value[channel], factor.x, t[channel]);
+            t[channel] = solution.x;
+            rise -= WEIGHTS[channel] * share * solution.x * factor.y / solution.y;
         }
         float error = dot(WEIGHTS, t) - y;
         if (abs(error) <= PRECISION * y) break;

@@ -123,8 +123,8 @@ void main() {
     vec3 offset = mean - center;
     vec3 rgb = sh_color(i, normalize(offset * finite_scale(length(offset))));
     if (LAMP) {
-        Lamp own = load_lamp();
-        rgb = lamp_lit(own, lamp_factor(own, lamp_at(own, mean_in_view)), rgb);
+        Lamp loaded = load_lamp();
+        rgb = lamp_lit(loaded, lamp_factor(loaded, lamp_at(loaded, mean_in_view)), rgb);
     }
     rgb = shown(rgb);
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;

@@ -190,15 +190,15 @@ void main() {
     vec3 d_row1 = view_rotation * (scaled_axes * d.u1);
     vec3 d_mean_in_view = camera_backward(mean_in_view, camera, d_mean2d, d_row0, d_row1);
     if (LAMP) {
-        Lamp own = load_lamp();
-        LampPoint at = lamp_at(own, mean_in_view);
-        float factor = lamp_factor(own, at), d_log_factor = 0.0;
+        Lamp loaded = load_lamp();
+        LampPoint at = lamp_at(loaded, mean_in_view);
+        float factor = lamp_factor(loaded, at), d_log_factor = 0.0;
         for (uint c = 0; c < 3; c++) {
-            float x = lamp_tone_inverse(own, color[c] - own.black), d_x = d_color[c] * lamp_tone_slope(own, x);
+            float x = lamp_tone_inverse(loaded, color[c] - loaded.black), d_x = d_color[c] * lamp_tone_slope(loaded, x);
             d_log_factor += d_x * x;
-            d_color[c] = d_x * factor / lamp_tone_slope(own, x / factor);
+            d_color[c] = d_x * factor / lamp_tone_slope(loaded, x / factor);
         }
-        d_mean_in_view += d_log_factor * lamp_point_gradient(own, at);
+        d_mean_in_view += d_log_factor * lamp_point_gradient(loaded, at);
     }
     vec3 offset = offset_from_camera(mean, camera.view_from_world);
     vec3 d_mean = world_from_view * d_mean_in_view + sh_backward(i, offset, d_color);

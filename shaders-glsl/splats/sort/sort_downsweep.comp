@@ -60,11 +60,11 @@ void find_first_places(uint first, uint end) {
         barrier();
     }
     for (uint digit = thread(); digit < 1u << digit_bits; digit += THREADS) {
-        uint place = digit_begins[digit] + table[own_table + (WORKGROUP_INDEX << digit_bits) + digit];
+        uint position = digit_begins[digit] + table[own_table + (WORKGROUP_INDEX << digit_bits) + digit];
         [[unroll]] for (uint k = 0; k < SUBGROUPS; k++) {
             uint key_count = is_shared() ? keys_with_digit[k * MAX_DIGITS + digit] : 0;
-            next_place[k * MAX_DIGITS + digit] = place;
-            place += key_count;
+            next_place[k * MAX_DIGITS + digit] = position;
+            position += key_count;
         }
     }
     if (is_shared()) barrier();
@@ -108,7 +108,7 @@ void main() {
     if (counts_next) clear_row(cleared_table);
     find_first_places(i, end);
 
-    uint own = gl_LocalInvocationID.y * MAX_DIGITS;
+    uint row_begin = gl_LocalInvocationID.y * MAX_DIGITS;
     for (uint first = begin; first < end; first += SUBGROUP_SIZE, i += SUBGROUP_SIZE) {
         bool holds_pair = i < end;
         uint key = next_key, value = next_value;
@@ -118,14 +118,14 @@ void main() {
         uint digit = digit_of(key, shift, digit_bits);
         uvec4 lanes = lanes_of_digit(digit, holds_pair);
         uint rank = subgroupBallotExclusiveBitCount(lanes);
-        uint place = next_place[own + digit] + rank;
+        uint position = next_place[row_begin + digit] + rank;
         share_places();
         if (holds_pair) {
-            sorted_keys[place] = key;
-            sorted_values[place] = value;
-            if (rank + 1 == subgroupBallotBitCount(lanes)) next_place[own + digit] = place + 1;
+            sorted_keys[position] = key;
+            sorted_values[position] = value;
+            if (rank + 1 == subgroupBallotBitCount(lanes)) next_place[row_begin + digit] = position + 1;
             if (counts_next) {
-                uint row = place / (PARTITION_SIZE * SUBGROUPS);
+                uint row = position / (PARTITION_SIZE * SUBGROUPS);
                 atomicAdd(table[next_table + (row << next_bits) + digit_of(key, shift + digit_bits, next_bits)], 1);
             }
         }

@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 
 use super::Bench;
 use crate::Result;
-use crate::ceilings::{Ceiling, Operation};
+use crate::ceilings::{Ceiling, CeilingOperation};
 
 /// The measured ceilings.
 #[derive(Clone, Copy, Debug)]
@@ -24,9 +24,9 @@ impl Ceilings {
             Ok(ceiling.amount(operation) / seconds)
         };
         Ok(Self {
-            bytes: speed(Operation::Copy)?,
-            flops: speed(Operation::MultiplyAdd)?,
-            exchanges: speed(Operation::Exchange)?,
+            bytes: speed(CeilingOperation::Copy)?,
+            flops: speed(CeilingOperation::MultiplyAdd)?,
+            exchanges: speed(CeilingOperation::Exchange)?,
         })
     }
 

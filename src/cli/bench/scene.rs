@@ -32,7 +32,7 @@ impl Source {
     pub(super) fn open(path: &Path, size: [u32; 2]) -> Result<Self> {
         let (gaussians, facts) = models::read(path)?;
         let mut model = Model::of_shown(gaussians, &facts);
-        let own = match path.is_dir() {
+        let camera_of_run = match path.is_dir() {
             true => {
                 let config = run::load_config(path)?;
                 let dataset = Dataset::load(&config.dataset, &config.load_options())?;
@@ -40,7 +40,7 @@ impl Source {
             }
             false => None,
         };
-        let camera = own.unwrap_or_else(|| facing(&model.gaussians, size));
+        let camera = camera_of_run.unwrap_or_else(|| facing(&model.gaussians, size));
         let origin = std::mem::take(&mut model.gaussians.origin);
         let view_from_world = camera.view_from_world * DAffine3::from_translation(origin);
         let camera = Camera { view_from_world, ..camera };

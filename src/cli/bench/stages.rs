@@ -72,11 +72,11 @@ pub(super) fn time_kernels(
         for name in names {
             let of_run = |times: &Vec<PassTime>| of_kernels(times, &[name]);
             let passes = times[0].iter().filter(|time| time.name == name);
-            let own = || KernelTime {
+            let kernel_time = || KernelTime {
                 milliseconds: median(times.iter().map(of_run).collect()),
                 bytes: passes.map(|time| time.bytes).sum(),
             };
-            kernels.entry(name).or_insert_with(own);
+            kernels.entry(name).or_insert_with(kernel_time);
         }
     }
     Ok(kernels)

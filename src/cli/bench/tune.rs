@@ -96,8 +96,8 @@ fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
     let cases = || cases.iter().filter(|case| case.channels == channels);
     let cost = |tile: Tile| {
         let relative = |case: &Case| {
-            let own = case.candidates().find(|measured| measured.tile == tile);
-            own.map_or(f64::INFINITY, |own| own.rasteriser() / case.least())
+            let timing = case.candidates().find(|measured| measured.tile == tile);
+            timing.map_or(f64::INFINITY, |timing| timing.rasteriser() / case.least())
         };
         cases().map(relative).sum::<f64>()
     };
@@ -124,7 +124,8 @@ impl Case {
             let settings = RenderSettings { tile: Some(tile), ..scene.render_settings() };
             let renderer = Renderer::new(gpu, settings)?;
             let resources = renderer.blend_statistics()?;
-            let resources = resources.map(|all| all.each_ref().map(|own| Resources::of(own)));
+            let resources = resources
+                .map(|all| all.each_ref().map(|kernel| Resources::from_statistics(kernel)));
             Ok((tile, renderer, resources))
         });
         let compiled = compiled.collect::<crate::Result<Vec<_>>>()?;
@@ -343,13 +344,13 @@ mod tests {
     fn a_tile_that_spills_is_taken_only_where_all_do() {
         let (small, large) = ([8, 8], [16, 16]);
         let chosen = |spills: [f64; 2]| {
-            let mut own = case(3, &[(small, 2.0, 0.0), (large, 1.0, 0.0)]);
-            for (measured, value) in own.tiles.iter_mut().zip(spills) {
+            let mut tuned = case(3, &[(small, 2.0, 0.0), (large, 1.0, 0.0)]);
+            for (measured, value) in tuned.tiles.iter_mut().zip(spills) {
                 let spills = |count| Resources { spills: Some(count), ..Resources::default() };
                 measured.resources = Some([spills(0.0), spills(value)]);
             }
-            let text = own.as_text();
-            (fastest(&[own], 3).unwrap().tile, text)
+            let text = tuned.as_text();
+            (fastest(&[tuned], 3).unwrap().tile, text)
         };
         assert_eq!(chosen([0.0, 0.0]).0, large.into());
         let (tile, text) = chosen([0.0, 4.0]);

@@ -14,7 +14,7 @@ use crate::results::edit::fingerprint;
 use crate::results::export::page::packed;
 use crate::results::models;
 use crate::results::run::{Event, Requests, Stamp, WatchedRun, stamp};
-use crate::splats::scene::{Facts, Gaussians};
+use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::{Result, Stop};
 
 /// The most Gaussians that are sent: those that cover most, by opacity and size.
@@ -28,7 +28,7 @@ const STATE_EVERY: Duration = Duration::from_millis(250);
 
 /// What is shown.
 #[derive(Debug)]
-enum Source {
+enum FeedSource {
     Run(WatchedRun),
     /// A model file, read again when it changes.
     File(PathBuf),
@@ -41,12 +41,12 @@ enum Source {
 pub(in crate::cli) struct Feed {
     /// To the training in this process.
     requests: Option<Requests>,
-    state: Mutex<State>,
+    state: Mutex<FeedState>,
 }
 
 #[derive(Debug)]
-struct State {
-    source: Source,
+struct FeedState {
+    source: FeedSource,
     /// Counts the models; 0: there is none yet.
     version: u64,
     model: Bytes,
@@ -67,13 +67,13 @@ struct State {
 impl Feed {
     /// Of a run directory; `requests`: to its training, if that is in this process.
     pub(in crate::cli) fn of_run(run: &Path, requests: Option<Requests>) -> Self {
-        let state = Mutex::new(State::of(Source::Run(WatchedRun::new(run.to_owned()))));
+        let state = Mutex::new(FeedState::new(FeedSource::Run(WatchedRun::new(run.to_owned()))));
         Self { requests, state }
     }
 
     /// Of a model file, with its Gaussians.
-    pub(in crate::cli) fn of_file(path: &Path) -> Result<(Self, Gaussians, Facts)> {
-        let mut state = State::of(Source::File(path.to_owned()));
+    pub(in crate::cli) fn of_file(path: &Path) -> Result<(Self, Gaussians, ModelFacts)> {
+        let mut state = FeedState::new(FeedSource::File(path.to_owned()));
         // Before reading: a file that changes meanwhile is read again.
         state.file = stamp(path).ok();
         let (gaussians, facts) = models::read(path)?;
@@ -83,7 +83,7 @@ impl Feed {
 
     /// Of Gaussians that do not change.
     pub(in crate::cli) fn of_gaussians(gaussians: &Gaussians) -> Self {
-        let mut state = State::of(Source::Fixed);
+        let mut state = FeedState::new(FeedSource::Fixed);
         state.show(gaussians, None);
         Self { requests: None, state: Mutex::new(state) }
     }
@@ -123,8 +123,9 @@ impl Feed {
     /// is asked for a snapshot.
     pub(super) fn state(&self) -> Value {
         let mut state = self.lock();
-        if let Some((_, known)) = state.told.as_ref().filter(|(at, _)| at.elapsed() < STATE_EVERY) {
-            return known.clone();
+        if let Some((_, answer)) = state.told.as_ref().filter(|(at, _)| at.elapsed() < STATE_EVERY)
+        {
+            return answer.clone();
         }
         let now = Instant::now();
         match &self.requests {
@@ -136,8 +137,8 @@ impl Feed {
             None => state.read(),
         }
         let mut told = match &mut state.source {
-            Source::Run(run) => json!(run.tail()),
-            Source::File(_) | Source::Fixed => json!({ "phase": "model" }),
+            FeedSource::Run(run) => json!(run.tail()),
+            FeedSource::File(_) | FeedSource::Fixed => json!({ "phase": "model" }),
         };
         let paused = self.requests.as_ref().is_some_and(Requests::is_paused);
         if paused {
@@ -152,13 +153,13 @@ impl Feed {
         told
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, FeedState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl State {
-    fn of(source: Source) -> Self {
+impl FeedState {
+    fn new(source: FeedSource) -> Self {
         Self {
             source,
             version: 0,
@@ -175,9 +176,9 @@ impl State {
     /// Reads the model file if it has changed. A file that has vanished or is damaged leaves the last model.
     fn read(&mut self) {
         let (path, from) = match &self.source {
-            Source::Run(run) => (run.path().join("model.ply"), run.path().to_owned()),
-            Source::File(path) => (path.clone(), path.clone()),
-            Source::Fixed => return,
+            FeedSource::Run(run) => (run.path().join("model.ply"), run.path().to_owned()),
+            FeedSource::File(path) => (path.clone(), path.clone()),
+            FeedSource::Fixed => return,
         };
         match stamp(&path) {
             Ok(found) if self.file == Some(found) => self.problem = None,

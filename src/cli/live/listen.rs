@@ -18,8 +18,8 @@ impl FromStr for Listen {
             Ok(port) => format!("127.0.0.1:{port}"),
             Err(_) => text.to_owned(),
         };
-        let known = whole.to_socket_addrs().ok().and_then(|mut found| found.next());
-        known
+        let address = whole.to_socket_addrs().ok().and_then(|mut found| found.next());
+        address
             .map(Self)
             .ok_or_else(|| format!("name a port, or a host and a port, such as {DEFAULT_ADDRESS}"))
     }

@@ -15,7 +15,7 @@ use crate::photographs::dataset::{Dataset, LoadOptions, MeasuredSize, View};
 use crate::photographs::image::Image;
 use crate::photographs::targets::Targets;
 use crate::photographs::tone::ToneCurve;
-use crate::results::export::page::{Bookmark, Picture, moved};
+use crate::results::export::page::{Bookmark, PageImage, moved};
 use crate::train::TrainConfig;
 
 /// What an image shows.
@@ -99,10 +99,10 @@ impl Pictures {
     /// their images.
     pub(in crate::cli) fn bookmarks(&self) -> Vec<Bookmark> {
         let origin = self.origin();
-        let bookmark = |(place, view): (usize, &View)| {
+        let bookmark = |(index, view): (usize, &View)| {
             let kinds = KINDS.iter().filter(|(_, kind)| self.has(view, *kind));
             let picture = |(name, _): &(&str, Kind)| {
-                ((*name).to_owned(), Picture::At(format!("picture/{place}/{name}")))
+                ((*name).to_owned(), PageImage::At(format!("picture/{index}/{name}")))
             };
             Bookmark {
                 name: view.name.clone(),
@@ -122,14 +122,14 @@ impl Pictures {
         }
     }
 
-    /// An image of the view at `place` in the dataset, upright, as JPEG; `None` if there is none.
-    pub(super) fn of(&mut self, place: usize, kind: &str) -> Result<Option<Bytes>> {
+    /// An image of the view at `view` in the dataset, upright, as JPEG; `None` if there is none.
+    pub(super) fn jpeg(&mut self, view: usize, kind: &str) -> Result<Option<Bytes>> {
         let Some((_, kind)) = KINDS.iter().find(|(name, _)| *name == kind) else { return Ok(None) };
-        let wanted = (place, *kind);
-        if let Some((_, known)) = self.finished.iter().find(|(key, _)| *key == wanted) {
-            return Ok(Some(known.clone()));
+        let wanted = (view, *kind);
+        if let Some((_, encoded)) = self.finished.iter().find(|(key, _)| *key == wanted) {
+            return Ok(Some(encoded.clone()));
         }
-        let Some(image) = self.image(place, *kind)? else { return Ok(None) };
+        let Some(image) = self.image(view, *kind)? else { return Ok(None) };
         let jpeg = Bytes::from(image.to_jpeg(QUALITY)?);
         self.finished.push_back((wanted, jpeg.clone()));
         while self.finished.iter().map(|(_, jpeg)| jpeg.len()).sum::<usize>() > KEPT {
@@ -138,16 +138,16 @@ impl Pictures {
         Ok(Some(jpeg))
     }
 
-    fn image(&mut self, place: usize, kind: Kind) -> Result<Option<Image>> {
+    fn image(&mut self, index: usize, kind: Kind) -> Result<Option<Image>> {
         let Self { dataset, unloaded, complete, config, gpu, targets, .. } = self;
-        let Some(mut view) = dataset.views.get(place) else { return Ok(None) };
+        let Some(mut view) = dataset.views.get(index) else { return Ok(None) };
         if kind != Kind::Reference && unloaded.contains(&view.name) {
             let all = match complete.take() {
                 Some(all) => all,
                 None => Dataset::load(&config.dataset, &options(config))?,
             };
             let all = complete.insert(all);
-            view = all.views.iter().find(|own| own.name == view.name).unwrap_or(view);
+            view = all.views.iter().find(|loaded| loaded.name == view.name).unwrap_or(view);
         }
         let image = match kind {
             Kind::Photograph => view.loaded()?.map(Cow::into_owned),
@@ -156,7 +156,7 @@ impl Pictures {
             Kind::Target => {
                 if targets.is_none() {
                     let opened = match gpu.take() {
-                        Some(own) => own,
+                        Some(made) => made,
                         None => driver::open(&config.device.parse()?)?,
                     };
                     *targets = Some(Targets::new(&opened, &config.tone, dataset)?);

@@ -77,7 +77,7 @@ impl Site {
             return Answer::NOT_FOUND;
         };
         let mut pictures = pictures.lock().unwrap_or_else(PoisonError::into_inner);
-        match pictures.of(view, kind) {
+        match pictures.jpeg(view, kind) {
             Ok(Some(jpeg)) => Answer::ok("image/jpeg", jpeg),
             Ok(None) => Answer::NOT_FOUND,
             Err(error) => {

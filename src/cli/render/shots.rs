@@ -82,14 +82,18 @@ fn of_path(
                 easing: args.easing.map(Into::into),
                 is_loop: args.is_loop,
             };
-            let own = FramePath::load(file, up, &options)?;
+            let frame_path = FramePath::load(file, up, &options)?;
             let first = poses.first().ok_or_else(|| {
                 Error::input(&dataset.root, "has no training view, whose size a path takes")
             })?;
-            let size = own.size.or(Some([first.width, first.height]));
+            let size = frame_path.size.or(Some([first.width, first.height]));
             let cameras: Vec<Camera> =
-                own.frames.iter().map(|frame| frame.camera(first, size)).collect();
-            (cameras, own.fps.map(|fps| fps.round().clamp(1.0, 1000.0) as u16), own.size)
+                frame_path.frames.iter().map(|frame| frame.camera(first, size)).collect();
+            (
+                cameras,
+                frame_path.fps.map(|fps| fps.round().clamp(1.0, 1000.0) as u16),
+                frame_path.size,
+            )
         }
         named => {
             if args.easing.is_some() || args.is_loop {

@@ -4,12 +4,12 @@ use std::path::Path;
 
 use serde_json::{Map, Value, json};
 
-use super::rows::{Row, Rows};
-use super::runner::Failure;
-use super::table::{KEYS, Quantity, Statistic};
+use super::rows::{SweepResults, SweepRow};
+use super::runner::FailedPoint;
+use super::table::{ColumnStatistic, KEYS, Quantity};
 use crate::Result;
 use crate::base::output::write_whole;
-use crate::results::report::{Chart, Mark, Report, Series, Table};
+use crate::results::report::{Chart, Mark, NumberTable, Report, Series};
 use crate::results::run::{Progress, energy_counters};
 
 /// The files of the costs.
@@ -55,7 +55,7 @@ fn front(points: &[(f64, f64)]) -> Vec<usize> {
     order
 }
 
-impl Rows {
+impl SweepResults {
     /// Writes [`FILES`] to `folder`; `notes` are paragraphs of the page.
     pub(super) fn save_costs(&self, folder: &Path, title: &str, notes: &[String]) -> Result<()> {
         let counters = energy_counters();
@@ -89,20 +89,20 @@ impl Rows {
     /// The Pareto front of the keys of a cost and a score.
     fn front_of(&self, keys: [&str; 2]) -> Vec<usize> {
         let [cost, gain] = keys.map(Quantity::new);
-        let value = |row: &Row, of: &Quantity| of.mean(row).unwrap_or(f64::NAN);
+        let value = |row: &SweepRow, of: &Quantity| of.mean(row).unwrap_or(f64::NAN);
         let points = self.rows.iter().map(|row| (value(row, &cost), value(row, &gain)));
         front(&points.collect::<Vec<_>>())
     }
 
     /// The quantities that any row has.
-    fn quantities(&self, statistic: Statistic) -> Vec<(Quantity, Statistic)> {
+    fn quantities(&self, statistic: ColumnStatistic) -> Vec<(Quantity, ColumnStatistic)> {
         let has = |of: &Quantity| self.rows.iter().any(|row| of.mean(row).is_some());
         KEYS.map(Quantity::new).into_iter().filter(has).map(|of| (of, statistic)).collect()
     }
 
     /// All rows with all quantities.
-    pub(super) fn costs(&self) -> Table {
-        let mut table = self.table("All points", &self.quantities(Statistic::Mean));
+    pub(super) fn costs(&self) -> NumberTable {
+        let mut table = self.table("All points", &self.quantities(ColumnStatistic::Mean));
         for (number, (label, _)) in (1..).zip(&mut table.rows) {
             *label = format!("{number}  {label}");
         }
@@ -110,9 +110,9 @@ impl Rows {
     }
 
     /// Differences to the baseline; `None` without a finished baseline.
-    fn differences(&self) -> Option<Table> {
+    fn differences(&self) -> Option<NumberTable> {
         let (base, name) = self.baseline().filter(|(row, _)| !row.metrics.is_empty())?;
-        let quantities = self.quantities(Statistic::Gain);
+        let quantities = self.quantities(ColumnStatistic::Gain);
         let mut table = self.table(&format!("The difference to {name}"), &quantities);
         for (column, (quantity, _)) in table.columns.iter_mut().zip(&quantities) {
             column.name.clone_from(&quantity.name);
@@ -130,9 +130,9 @@ impl Rows {
     /// Final score against cost; `None` unless two rows have both.
     fn front_chart(&self, keys: [&str; 2]) -> Option<Chart> {
         let [cost, gain] = keys.map(Quantity::new);
-        let point = |row: &Row| Some((cost.mean(row)?, gain.mean(row)?));
+        let point = |row: &SweepRow| Some((cost.mean(row)?, gain.mean(row)?));
         let front = self.front_of(keys);
-        let series = |(index, row): (usize, &Row)| Series {
+        let series = |(index, row): (usize, &SweepRow)| Series {
             points: point(row).into_iter().collect(),
             mark: if front.contains(&index) { Mark::Disc } else { Mark::Ring },
             ..self.series(index)
@@ -151,7 +151,7 @@ impl Rows {
     fn on_the_way(&self) -> Option<Chart> {
         let all = || self.rows.iter().flat_map(|row| &row.progress);
         let least = all().map(|one| one.psnr).fold(f64::NEG_INFINITY, f64::max) - SHOWN_DECIBELS;
-        let series = |(index, row): (usize, &Row)| {
+        let series = |(index, row): (usize, &SweepRow)| {
             let shown = row.progress.iter().filter(|one| one.psnr >= least);
             let points = shown.map(|one: &Progress| (one.seconds, one.psnr)).collect();
             Series { points, mark: Mark::Disc, ..self.series(index) }
@@ -183,7 +183,7 @@ impl Rows {
     }
 
     /// All quantities as JSON, with the differences to the baseline.
-    pub(super) fn json(&self, dataset: &Path, failures: &[Failure]) -> Value {
+    pub(super) fn json(&self, dataset: &Path, failures: &[FailedPoint]) -> Value {
         let keys = KEYS.into_iter().chain(self.scores.iter().map(String::as_str));
         let quantities: Vec<Quantity> = keys.map(Quantity::new).collect();
         let of = |value: &dyn Fn(&str) -> Option<f64>| {
@@ -192,7 +192,7 @@ impl Rows {
         };
         let fronts = NAMED_FRONTS.map(|[name, cost]| (name, self.front_of([cost, "psnr"])));
         let baseline = self.baseline();
-        let point = |(index, row): (usize, &Row)| {
+        let point = |(index, row): (usize, &SweepRow)| {
             let mut entry = json!({
                 "point": row.point.name(),
                 "settings": row.point.values.iter().cloned().collect::<std::collections::BTreeMap<_, _>>(),
@@ -209,7 +209,8 @@ impl Rows {
             }
             entry
         };
-        let failed = |Failure { name, reason }: &Failure| json!({"point": name, "reason": reason});
+        let failed =
+            |FailedPoint { name, reason }: &FailedPoint| json!({"point": name, "reason": reason});
         json!({
             "dataset": dataset.display().to_string(),
             "energy_counters": energy_counters(),
@@ -222,7 +223,7 @@ impl Rows {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::sweep::point::Point;
+    use crate::cli::sweep::point::SweepPoint;
 
     const MIB: f64 = 1_048_576.0;
 
@@ -236,20 +237,20 @@ mod tests {
         assert!(front(&[]).is_empty());
     }
 
-    fn row(values: &[(&str, &str)], figures: &[(f64, f64, f64)]) -> Row {
+    fn row(values: &[(&str, &str)], figures: &[(f64, f64, f64)]) -> SweepRow {
         let metrics = |&(psnr, seconds, bytes): &(f64, f64, f64)| {
             json!({"mean": {"psnr": psnr, "ssim": 0.5}, "seconds": seconds, "steps": 10, "gaussians": 7,
                 "spent": {"processor_seconds": 2.0 * seconds, "joules": null, "device_bytes": bytes}})
         };
         let values = values.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
-        Row {
-            point: Point { values: values.collect() },
+        SweepRow {
+            point: SweepPoint { values: values.collect() },
             metrics: figures.iter().map(metrics).collect(),
             progress: vec![],
         }
     }
 
-    fn rows() -> Rows {
+    fn rows() -> SweepResults {
         let balanced = ("preset", "balanced");
         let rows = vec![
             row(&[balanced], &[(25.0, 20.0, 3.0 * MIB), (26.0, 40.0, 3.0 * MIB)]),
@@ -257,7 +258,7 @@ mod tests {
             row(&[balanced, ("steps", "5")], &[(23.5, 15.0, 2.0 * MIB)]),
             row(&[balanced, ("steps", "9")], &[]),
         ];
-        Rows::of(rows, vec!["psnr".to_owned()], vec![], Some(balanced))
+        SweepResults::from_rows(rows, vec!["psnr".to_owned()], vec![], Some(balanced))
     }
 
     #[test]

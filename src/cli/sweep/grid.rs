@@ -1,6 +1,8 @@
 //! The points of a sweep: all combinations of the values of its axes, and named grids.
 
-use super::point::{ADAPTIVE, ALL_PARTS, Axis, OFFSET, PARTS, PLAIN, PRESET, Point, all_curves};
+use super::point::{
+    ADAPTIVE, ALL_PARTS, OFFSET, PARTS, PLAIN, PRESET, SweepAxis, SweepPoint, all_curves,
+};
 use crate::train::{Part, Preset};
 use crate::{Error, Result};
 
@@ -61,38 +63,45 @@ impl Grid {
         }
     }
 
-    fn grids(self) -> Vec<Vec<Axis>> {
-        let curve = |name| Axis::of("curve", &[name]);
+    fn grids(self) -> Vec<Vec<SweepAxis>> {
+        let curve = |name| SweepAxis::from_values("curve", &[name]);
         match self {
-            Self::Leaderboard => vec![vec![Axis { key: "curve".to_owned(), values: all_curves() }]],
+            Self::Leaderboard => {
+                vec![vec![SweepAxis { key: "curve".to_owned(), values: all_curves() }]]
+            }
             // 0.103 is the fixed offset of earlier work that the paper marks.
             Self::Offset => {
                 let levels =
                     ["0", "0.02", "0.04", "0.06", "0.08", "0.103", "0.12", "0.16", "0.2", ADAPTIVE];
-                vec![vec![curve("ap3"), Axis::of(OFFSET, &levels)]]
+                vec![vec![curve("ap3"), SweepAxis::from_values(OFFSET, &levels)]]
             }
             Self::Alpha => {
                 let alphas = ["0.04", "0.08", "0.12", "0.16", "0.2", "0.3"];
-                vec![vec![curve("ap3"), Axis::of("alpha", &alphas)]]
+                vec![vec![curve("ap3"), SweepAxis::from_values("alpha", &alphas)]]
             }
             Self::Gain => {
                 let gains = |c: &[&str], base: &[&str]| {
-                    vec![curve("ase"), Axis::of("gain", c), Axis::of("base_gain", base)]
+                    vec![
+                        curve("ase"),
+                        SweepAxis::from_values("gain", c),
+                        SweepAxis::from_values("base_gain", base),
+                    ]
                 };
                 vec![gains(&["0"], &["1", "2", "3", "4"]), gains(&["1", "2", "3", "4"], &["1"])]
             }
             Self::Parts => {
                 let [a, b, c, d] = Part::LITA.map(Part::name);
-                vec![vec![Axis::of(PARTS, &[PLAIN, a, b, c, d, ALL_PARTS])]]
+                vec![vec![SweepAxis::from_values(PARTS, &[PLAIN, a, b, c, d, ALL_PARTS])]]
             }
             Self::Presets => {
                 let presets = [Preset::Draft, Preset::Fast, Preset::Balanced, Preset::Best];
-                vec![vec![Axis::of(PRESET, &presets.map(Preset::name))]]
+                vec![vec![SweepAxis::from_values(PRESET, &presets.map(Preset::name))]]
             }
             Self::Changes => {
-                let base = || Axis::of(PRESET, &[Preset::Balanced.name()]);
-                let changes =
-                    CHANGES.iter().map(|(key, values)| vec![base(), Axis::of(key, values)]);
+                let base = || SweepAxis::from_values(PRESET, &[Preset::Balanced.name()]);
+                let changes = CHANGES
+                    .iter()
+                    .map(|(key, values)| vec![base(), SweepAxis::from_values(key, values)]);
                 std::iter::once(vec![base()]).chain(changes).collect()
             }
         }
@@ -101,7 +110,7 @@ impl Grid {
 
 /// The points of the axes, the first varying slowest. `given` replaces axes of a named grid with the same key, and
 /// adds to the others.
-pub(super) fn points(given: &[Axis], table: Option<Grid>) -> Result<Vec<Point>> {
+pub(super) fn points(given: &[SweepAxis], table: Option<Grid>) -> Result<Vec<SweepPoint>> {
     for (index, axis) in given.iter().enumerate() {
         if given[..index].iter().any(|other| other.key == axis.key) {
             return Err(Error::Usage(format!("{} is given twice; give one list", axis.key)));
@@ -124,21 +133,23 @@ pub(super) fn points(given: &[Axis], table: Option<Grid>) -> Result<Vec<Point>> 
         // Constants of other curves do not concern the baseline.
         let of_others = ["curve", "alpha", "beta", "gain", "base_gain", OFFSET];
         let shared = given.iter().filter(|axis| !of_others.contains(&axis.key.as_str())).cloned();
-        grids.push(std::iter::once(Axis::of("curve", &[curve])).chain(shared).collect());
+        grids.push(
+            std::iter::once(SweepAxis::from_values("curve", &[curve])).chain(shared).collect(),
+        );
     }
-    let mut points: Vec<Point> = vec![];
+    let mut points: Vec<SweepPoint> = vec![];
     for grid in &mut grids {
         grid.sort_by(|a, b| a.order().cmp(&b.order()));
         check(grid)?;
-        let point = |values| Point { values };
+        let point = |values| SweepPoint { values };
         let product = product(grid).into_iter().map(point);
-        let fresh: Vec<Point> = product.filter(|point| !points.contains(point)).collect();
+        let fresh: Vec<SweepPoint> = product.filter(|point| !points.contains(point)).collect();
         points.extend(fresh);
     }
     Ok(points)
 }
 
-fn check(grid: &[Axis]) -> Result<()> {
+fn check(grid: &[SweepAxis]) -> Result<()> {
     let has = |key: &str| grid.iter().any(|axis| axis.key == key);
     if grid.is_empty() {
         let problem = "the grid is empty; give --curves, --alpha, --grid, --seeds or --table";
@@ -152,7 +163,7 @@ fn check(grid: &[Axis]) -> Result<()> {
     Ok(())
 }
 
-fn product(axes: &[Axis]) -> Vec<Vec<(String, String)>> {
+fn product(axes: &[SweepAxis]) -> Vec<Vec<(String, String)>> {
     axes.iter().fold(vec![vec![]], |points, axis| {
         let with = |point: &Vec<(String, String)>| {
             let extended = axis.values.iter().map(|value| {
@@ -173,14 +184,14 @@ mod tests {
     use crate::train::TrainConfig;
 
     fn names(given: &[(&str, &str)], table: Option<Grid>) -> Vec<String> {
-        let axes: Vec<Axis> =
-            given.iter().map(|(key, list)| Axis::new(key, list).unwrap()).collect();
-        points(&axes, table).unwrap().iter().map(Point::name).collect()
+        let axes: Vec<SweepAxis> =
+            given.iter().map(|(key, list)| SweepAxis::new(key, list).unwrap()).collect();
+        points(&axes, table).unwrap().iter().map(SweepPoint::name).collect()
     }
 
     fn refused(given: &[(&str, &str)], part: &str) {
-        let axes: Result<Vec<Axis>> =
-            given.iter().map(|(key, list)| Axis::new(key, list)).collect();
+        let axes: Result<Vec<SweepAxis>> =
+            given.iter().map(|(key, list)| SweepAxis::new(key, list)).collect();
         let message = axes.and_then(|axes| points(&axes, None)).unwrap_err().to_string();
         assert!(message.contains(part), "no `{part}` in: {message}");
     }
@@ -200,10 +211,10 @@ mod tests {
     #[test]
     fn a_point_is_a_list_of_arguments() {
         let axes = [("curve", "my.toml"), ("beta", "1"), ("steps", "2"), ("seed", "3")];
-        let axes = axes.map(|(key, list)| Axis::new(key, list).unwrap());
+        let axes = axes.map(|(key, list)| SweepAxis::new(key, list).unwrap());
         let arguments = points(&axes, None).unwrap()[0].arguments().join(" ");
         assert_eq!(arguments, "--curve my.toml --set tone.beta=1 --set steps=2 --seed 3");
-        let offsets = points(&[Axis::new("offset", "0.1,adaptive").unwrap()], None).unwrap();
+        let offsets = points(&[SweepAxis::new("offset", "0.1,adaptive").unwrap()], None).unwrap();
         assert_eq!(offsets[0].arguments().join(" "), "--set tone.alpha=0.1 --set tone.beta=0");
         assert!(offsets[1].arguments().is_empty());
     }
@@ -213,7 +224,7 @@ mod tests {
         let names = names(&[("curve", "a/b.toml,a_b.toml,ap3,é")], None);
         assert_eq!(names[1..3], ["curve=a_b.toml", "curve=ap3"]);
         assert!(names[0].starts_with("curve=a_b.toml-") && names[3].starts_with("curve=_-"));
-        let long = Point { values: vec![("key".to_owned(), "x".repeat(500))] };
+        let long = SweepPoint { values: vec![("key".to_owned(), "x".repeat(500))] };
         assert!(long.name().len() < 200);
     }
 

@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use super::point::{ADAPTIVE, OFFSET};
-use super::rows::{Row, Rows};
+use super::rows::{SweepResults, SweepRow};
 use super::run::Run;
-use super::runner::Failure;
-use super::table::{CsvColumn, Quantity, Statistic};
+use super::runner::FailedPoint;
+use super::table::{ColumnStatistic, CsvColumn, Quantity};
 use crate::Result;
 use crate::base::output::{csv_field, write_whole};
 use crate::gpu::Gpu;
@@ -14,7 +14,9 @@ use crate::photographs::dataset::Dataset;
 use crate::photographs::image::Image;
 use crate::photographs::metrics::Scores;
 use crate::results::eval::{AGAINST, WITH_REFERENCE};
-use crate::results::report::{Chart, Column, Comparison, Mark, Picture, Report, Series, Table};
+use crate::results::report::{
+    Chart, Column, Comparison, Mark, NumberTable, Picture, Report, Series,
+};
 
 /// The files of a leaderboard.
 pub(super) const FILES: [&str; 3] = ["leaderboard.csv", "leaderboard.md", "index.html"];
@@ -31,7 +33,7 @@ const MAX_PICTURES: usize = 8;
 /// The leaderboard of a sweep.
 #[derive(Clone, Debug)]
 pub(super) struct Leaderboard<'a> {
-    pub(super) rows: &'a Rows,
+    pub(super) rows: &'a SweepResults,
     pub(super) title: String,
     /// First paragraphs of the page.
     pub(super) intro: Vec<String>,
@@ -39,7 +41,7 @@ pub(super) struct Leaderboard<'a> {
     pub(super) links: Vec<[String; 2]>,
     /// Mean delta0 of the adaptive black level.
     pub(super) adaptive_offset: Option<f64>,
-    pub(super) failures: &'a [Failure],
+    pub(super) failures: &'a [FailedPoint],
 }
 
 impl Leaderboard<'_> {
@@ -52,17 +54,17 @@ impl Leaderboard<'_> {
     }
 
     /// The rows with their scores and the differences to the baseline, if there is one.
-    pub(super) fn table(&self) -> Table {
-        let Rows { keys, rows, scores, .. } = self.rows;
+    pub(super) fn table(&self) -> NumberTable {
+        let SweepResults { keys, rows, scores, .. } = self.rows;
         let has_seeds = self.rows.has_seeds();
         let mut columns = vec![];
         for quantity in scores.iter().map(|score| Quantity::new(score)) {
-            columns.push((quantity.clone(), Statistic::Mean));
-            columns.extend(has_seeds.then(|| (quantity.clone(), Statistic::Deviation)));
-            let gain = self.rows.baseline().map(|_| (quantity, Statistic::Gain));
+            columns.push((quantity.clone(), ColumnStatistic::Mean));
+            columns.extend(has_seeds.then(|| (quantity.clone(), ColumnStatistic::Deviation)));
+            let gain = self.rows.baseline().map(|_| (quantity, ColumnStatistic::Gain));
             columns.extend(gain);
         }
-        columns.push((Quantity::new("gaussians"), Statistic::Mean));
+        columns.push((Quantity::new("gaussians"), ColumnStatistic::Mean));
         let mut table = self.rows.table("Means over the test views", &columns);
         if let [key] = &keys[..] {
             table.label.clone_from(key);
@@ -77,18 +79,18 @@ impl Leaderboard<'_> {
     }
 
     fn csv(&self) -> String {
-        let Rows { rows, scores, .. } = self.rows;
+        let SweepResults { rows, scores, .. } = self.rows;
         let has_seeds = self.rows.has_seeds();
         let numbers = scores.iter().flat_map(|score| self.rows.csv_numbers(score, has_seeds));
         let mut columns: Vec<CsvColumn> = numbers.collect();
         columns.extend(self.rows.csv_numbers("gaussians", false));
         columns.push(self.rows.csv_column("runs", |_, row| row.metrics.len().to_string()));
-        if rows.iter().any(Row::knows_references) {
-            let cell = |_, row: &Row| row.knows_references().to_string();
+        if rows.iter().any(SweepRow::knows_references) {
+            let cell = |_, row: &SweepRow| row.knows_references().to_string();
             columns.push(self.rows.csv_column(WITH_REFERENCE, cell));
         }
         if rows.iter().any(|row| row.against().is_some()) {
-            let cell = |_, row: &Row| csv_field(row.against().unwrap_or_default()).to_string();
+            let cell = |_, row: &SweepRow| csv_field(row.against().unwrap_or_default()).to_string();
             columns.push(self.rows.csv_column(AGAINST, cell));
         }
         self.rows.csv(columns)
@@ -126,7 +128,7 @@ impl Leaderboard<'_> {
         if let Some(dark) = &dark {
             // A model must beat the score of the photograph itself.
             let of_photograph =
-                reference.as_ref().and_then(|reference| Scores::of(dark, reference).ok());
+                reference.as_ref().and_then(|reference| Scores::measure(dark, reference).ok());
             let scores = scored(
                 of_photograph.map(|scores| scores.psnr),
                 of_photograph.map(|scores| scores.ssim),
@@ -168,11 +170,11 @@ impl Leaderboard<'_> {
         if let Some((_, name)) = self.rows.baseline() {
             notes.push(format!("Gains are differences to {name}."));
         }
-        if self.rows.rows.iter().any(Row::knows_references) {
+        if self.rows.rows.iter().any(SweepRow::knows_references) {
             notes.push("Rows marked \"with reference\" were trained on targets that depend on references; they do \
              not compare with the others.".to_owned());
         }
-        let mut against: Vec<&str> = self.rows.rows.iter().filter_map(Row::against).collect();
+        let mut against: Vec<&str> = self.rows.rows.iter().filter_map(SweepRow::against).collect();
         against.sort_unstable();
         against.dedup();
         notes.extend(against.iter().map(|against| format!("Test views are scored {against}.")));
@@ -181,8 +183,10 @@ impl Leaderboard<'_> {
                 "The adaptive black level is {offset:.4}, the mean of delta0 over the training views."
             ));
         }
-        let failed =
-            self.failures.iter().map(|Failure { name, reason }| format!("{name} failed: {reason}"));
+        let failed = self
+            .failures
+            .iter()
+            .map(|FailedPoint { name, reason }| format!("{name} failed: {reason}"));
         notes.extend(failed);
         notes
     }
@@ -197,7 +201,7 @@ impl Leaderboard<'_> {
         if !charts.is_empty() || !has_scores {
             return charts;
         }
-        let bar = |(index, row): (usize, &Row)| {
+        let bar = |(index, row): (usize, &SweepRow)| {
             let x = index as f64;
             let spread = row.extremes("psnr").map(|[low, high]| (x, low, high));
             Series {
@@ -213,7 +217,7 @@ impl Leaderboard<'_> {
     }
 
     /// A line for each combination of the other settings; `None` if `key` is not numeric, or there are too many lines.
-    fn against(&self, key: &str, y_name: &str, known: &mut Vec<String>) -> Option<Chart> {
+    fn against(&self, key: &str, y_name: &str, line_names: &mut Vec<String>) -> Option<Chart> {
         let is_special = |value: &str| key == OFFSET && value == ADAPTIVE;
         let values = self.rows.rows.iter().filter_map(|row| row.point.value(key));
         let numbers: Vec<f64> = values
@@ -262,10 +266,10 @@ impl Leaderboard<'_> {
         }
         lines.sort_by(|a, b| a.name.cmp(&b.name));
         for line in &mut lines {
-            let index = known.iter().position(|name| *name == line.name);
-            line.color = Some(index.unwrap_or(known.len()));
+            let index = line_names.iter().position(|name| *name == line.name);
+            line.color = Some(index.unwrap_or(line_names.len()));
             if index.is_none() {
-                known.push(line.name.clone());
+                line_names.push(line.name.clone());
             }
         }
         let is_legible = (1..=MAX_LINES).contains(&lines.len());

@@ -38,13 +38,13 @@ const AXES: [(&str, &str); 10] = [
 
 /// A setting with a list of values.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Axis {
+pub(super) struct SweepAxis {
     /// A name of [`AXES`], or the key of any other setting.
     pub(super) key: String,
     pub(super) values: Vec<String>,
 }
 
-impl Axis {
+impl SweepAxis {
     /// The axis of a comma-separated list; commas within brackets or quotes do not separate.
     pub(super) fn new(key: &str, list: &str) -> Result<Self> {
         let key = key.trim();
@@ -69,7 +69,7 @@ impl Axis {
         Ok(axis)
     }
 
-    pub(super) fn of(key: &str, values: &[&str]) -> Self {
+    pub(super) fn from_values(key: &str, values: &[&str]) -> Self {
         Self { key: key.to_owned(), values: values.iter().map(|&value| value.to_owned()).collect() }
     }
 
@@ -124,12 +124,12 @@ fn curve(name: &str) -> String {
 
 /// The settings of a point.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Point {
+pub(super) struct SweepPoint {
     /// Axes and values, in the order of the name.
     pub(super) values: Vec<(String, String)>,
 }
 
-impl Point {
+impl SweepPoint {
     pub(super) fn value(&self, key: &str) -> Option<&str> {
         self.values.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
     }

@@ -2,18 +2,18 @@
 
 use serde_json::Value;
 
-use super::point::{PARTS, PRESET, Point, SEED};
+use super::point::{PARTS, PRESET, SEED, SweepPoint};
 use super::run::Run;
 use crate::results::eval::{AGAINST, WITH_REFERENCE};
 use crate::results::run::{Progress, load_progress};
 
 /// The results of a sweep.
 #[derive(Clone, Debug)]
-pub(super) struct Rows {
+pub(super) struct SweepResults {
     /// The axes along which points differ, without the seed.
     pub(super) keys: Vec<String>,
     /// Best PSNR first, points without a score last.
-    pub(super) rows: Vec<Row>,
+    pub(super) rows: Vec<SweepRow>,
     /// Names of the scores, as `metrics.json` has them below `mean`.
     pub(super) scores: Vec<String>,
     /// All seeds.
@@ -26,26 +26,26 @@ pub(super) struct Rows {
 
 /// A point with all its seeds.
 #[derive(Clone, Debug)]
-pub(super) struct Row {
+pub(super) struct SweepRow {
     /// The point without its seed.
-    pub(super) point: Point,
+    pub(super) point: SweepPoint,
     /// `metrics.json` of each finished run.
     pub(super) metrics: Vec<Value>,
     /// Intermediate scores of the first finished run.
     pub(super) progress: Vec<Progress>,
 }
 
-impl Rows {
+impl SweepResults {
     /// Reads the results of the finished `runs`; points without one have a row, too.
     pub(super) fn new(runs: &[Run], baseline: Option<(&'static str, &'static str)>) -> Self {
-        let (mut rows, mut scores, mut seeds): (Vec<Row>, Vec<String>, Vec<String>) =
+        let (mut rows, mut scores, mut seeds): (Vec<SweepRow>, Vec<String>, Vec<String>) =
             Default::default();
         for run in runs {
             let point = run.point.seedless();
             let seed = run.point.value(SEED).map(str::to_owned);
             seeds.extend(seed.filter(|seed| !seeds.contains(seed)));
             let index = rows.iter().position(|row| row.point == point).unwrap_or_else(|| {
-                rows.push(Row { point, metrics: vec![], progress: vec![] });
+                rows.push(SweepRow { point, metrics: vec![], progress: vec![] });
                 rows.len() - 1
             });
             let Some(metrics) = run.metrics() else { continue };
@@ -60,18 +60,18 @@ impl Rows {
             }
             row.metrics.push(metrics);
         }
-        Self { runs: runs.len(), ..Self::of(rows, scores, seeds, baseline) }
+        Self { runs: runs.len(), ..Self::from_rows(rows, scores, seeds, baseline) }
     }
 
     /// Sorts the rows.
-    pub(super) fn of(
-        mut rows: Vec<Row>,
+    pub(super) fn from_rows(
+        mut rows: Vec<SweepRow>,
         scores: Vec<String>,
         seeds: Vec<String>,
         baseline: Option<(&'static str, &'static str)>,
     ) -> Self {
         // Stable, so that equal rows keep the order of the grid.
-        let psnr = |row: &Row| row.score("psnr").unwrap_or(f64::NEG_INFINITY);
+        let psnr = |row: &SweepRow| row.score("psnr").unwrap_or(f64::NEG_INFINITY);
         rows.sort_by(|a, b| psnr(b).total_cmp(&psnr(a)));
         Self { keys: differing(&rows), rows, scores, seeds, runs: 0, baseline }
     }
@@ -81,7 +81,7 @@ impl Rows {
     }
 
     /// The settings of a row as a label, without the axis `except`.
-    pub(super) fn label(&self, row: &Row, except: Option<&str>) -> String {
+    pub(super) fn label(&self, row: &SweepRow, except: Option<&str>) -> String {
         let speaks = |key: &str| {
             ["curve", PRESET, PARTS].contains(&key) || (except.is_none() && self.keys.len() == 1)
         };
@@ -99,7 +99,7 @@ impl Rows {
 
     /// The baseline and its name: of the rows with its value, the one with the fewest settings. `None` if there are
     /// several.
-    pub(super) fn baseline(&self) -> Option<(&Row, String)> {
+    pub(super) fn baseline(&self) -> Option<(&SweepRow, String)> {
         let (key, value) = self.baseline?;
         let matching = || self.rows.iter().filter(|row| row.point.value(key) == Some(value));
         let fewest = matching().map(|row| row.point.values.len()).min()?;
@@ -109,7 +109,7 @@ impl Rows {
     }
 }
 
-impl Row {
+impl SweepRow {
     /// Mean over finished runs of the number at a JSON pointer in `metrics.json`.
     pub(super) fn mean(&self, pointer: &str) -> Option<f64> {
         mean(&self.values(pointer))
@@ -172,10 +172,10 @@ fn score_names(mean: &Value) -> Vec<String> {
 }
 
 /// The axes along which the points differ; all axes if there is one point.
-fn differing(rows: &[Row]) -> Vec<String> {
+fn differing(rows: &[SweepRow]) -> Vec<String> {
     let mut keys: Vec<&String> = vec![];
     // The point with the most axes determines the order.
-    let mut points: Vec<&Point> = rows.iter().map(|row| &row.point).collect();
+    let mut points: Vec<&SweepPoint> = rows.iter().map(|row| &row.point).collect();
     points.sort_by_key(|point| std::cmp::Reverse(point.values.len()));
     for (key, _) in points.iter().flat_map(|point| &point.values) {
         if !keys.contains(&key) {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::point::{PRESET, Point};
+use super::point::{PRESET, SweepPoint};
 use super::scores;
 use crate::cli::quoted;
 use crate::cli::train::TrainArgs;
@@ -23,7 +23,7 @@ use crate::{Error, Result};
 #[derive(Clone, Debug)]
 pub(super) struct Run {
     pub(super) name: String,
-    pub(super) point: Point,
+    pub(super) point: SweepPoint,
     pub(super) folder: PathBuf,
     /// Arguments of `nightsplat`.
     pub(super) arguments: Vec<String>,
@@ -36,7 +36,12 @@ impl Run {
     /// The run of a point with the options `shared`, in a folder of `out`; both paths are absolute. Points with a
     /// preset train with its plan for the photographs, as `train --preset` does; others train without a plan, so that
     /// they differ in nothing but their settings.
-    pub(super) fn new(point: Point, dataset: &str, shared: &[String], out: &Path) -> Result<Self> {
+    pub(super) fn new(
+        point: SweepPoint,
+        dataset: &str,
+        shared: &[String],
+        out: &Path,
+    ) -> Result<Self> {
         let name = point.name();
         let folder = out.join(&name);
         let mut arguments = vec!["train".to_owned(), dataset.to_owned()];

@@ -21,7 +21,7 @@ use crate::{Error, Result, Stop};
 
 /// A point that failed.
 #[derive(Clone, Debug)]
-pub(super) struct Failure {
+pub(super) struct FailedPoint {
     /// The point's name.
     pub(super) name: String,
     /// Last error of its process.
@@ -38,7 +38,7 @@ pub(super) fn train(
     bar: &ProgressBar,
     folder: &Path,
     all: usize,
-) -> Result<Vec<Failure>> {
+) -> Result<Vec<FailedPoint>> {
     let requests = signals::requests()?;
     let time_up = AtomicBool::new(false);
     bar.enable_steady_tick(Duration::from_secs(1));
@@ -47,9 +47,9 @@ pub(super) fn train(
     let finish = |index: usize, waits: bool| {
         let run: &Run = runs[index];
         let failure = match attempt(run, waits, &requests) {
-            Ok(Outcome::Finished) => None,
-            Ok(Outcome::Busy) => return locked(&busy).push(index),
-            Ok(Outcome::Saved) => return time_up.store(true, Ordering::Relaxed),
+            Ok(RunState::Finished) => None,
+            Ok(RunState::Busy) => return locked(&busy).push(index),
+            Ok(RunState::Saved) => return time_up.store(true, Ordering::Relaxed),
             Err(error) => Some(error.to_string()),
         };
         bar.set_message(run.name.clone());
@@ -64,7 +64,7 @@ pub(super) fn train(
         }
         if let Some(reason) = failure {
             bar.suspend(|| tracing::warn!("{} failed: {reason}", run.name));
-            locked(&failures).push((index, Failure { name: run.name.clone(), reason }));
+            locked(&failures).push((index, FailedPoint { name: run.name.clone(), reason }));
         }
     };
     std::thread::scope(|scope| {
@@ -103,7 +103,7 @@ fn locked<T>(list: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
 }
 
 /// The state of a run.
-enum Outcome {
+enum RunState {
     Finished,
     /// Another process trains it.
     Busy,
@@ -112,19 +112,19 @@ enum Outcome {
 }
 
 /// Trains a run unless it is finished, or another process trains it and `waits` is false.
-fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
+fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<RunState> {
     let unusable =
         |error: std::io::Error| Error::output(&run.folder, format!("cannot be used: {error}"));
     std::fs::create_dir_all(&run.folder).map_err(unusable)?;
     let lock = File::create(run.folder.join("lock")).map_err(unusable)?;
     match lock.try_lock() {
         Err(TryLockError::WouldBlock) if waits => lock.lock().map_err(unusable)?,
-        Err(TryLockError::WouldBlock) => return Ok(Outcome::Busy),
+        Err(TryLockError::WouldBlock) => return Ok(RunState::Busy),
         // Without file locks, only one sweep at a time is safe.
         Err(TryLockError::Error(_)) | Ok(()) => {}
     }
     if run.is_finished()? {
-        return Ok(Outcome::Finished);
+        return Ok(RunState::Finished);
     }
     let log = run.folder.join("log.txt");
     let mut output = File::create(&log).map_err(unusable)?;
@@ -139,11 +139,11 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
         .map_err(unusable)?;
     let status = child::ended(&mut process, requests).map_err(unusable)?;
     if status.success() && run.is_finished()? {
-        return Ok(Outcome::Finished);
+        return Ok(RunState::Finished);
     }
     let stops = [Stop::Interrupted, Stop::Terminated, Stop::TimeUp];
     if stops.iter().any(|stop| status.code() == Some(stop.exit_code().into())) {
-        return Ok(Outcome::Saved);
+        return Ok(RunState::Saved);
     }
     let printed = std::fs::read(&log).unwrap_or_default();
     let reason = last_words(&String::from_utf8_lossy(&printed), status);

@@ -13,19 +13,19 @@ use std::path::Path;
 use anyhow::Result;
 
 use super::SweepArgs;
-use super::rows::{Row, Rows, number};
+use super::rows::{SweepResults, SweepRow, number};
 use crate::Error;
 use crate::base::output::{csv_field, printable, write_whole};
 use crate::cli::finish;
-use crate::networks::lpips::Measure;
+use crate::networks::lpips::LpipsVersion;
 
 /// The tables, which a later sweep of the folder replaces.
 const FILES: [&str; 3] = ["scenes.md", "scenes.csv", "scenes.tex"];
 
 /// A dataset with the results of its sweep.
-struct Scene {
+struct SceneResults {
     name: String,
-    rows: Rows,
+    rows: SweepResults,
 }
 
 /// Sweeps one dataset after the other, and writes the tables.
@@ -55,12 +55,12 @@ pub(super) fn run(args: &SweepArgs) -> Result<()> {
             continue;
         };
         failed.extend(failures.into_iter().map(|failure| (name.clone(), failure)));
-        scenes.push(Scene { name, rows });
+        scenes.push(SceneResults { name, rows });
     }
     if scenes.is_empty() {
         return Ok(());
     }
-    let table = SceneTable::of(&scenes);
+    let table = SceneTable::new(&scenes);
     save(&table, &args.out)?;
     if !args.json {
         writeln!(std::io::stdout(), "{}", printable(&table.markdown()))?;
@@ -97,19 +97,19 @@ struct SceneTable {
 
 impl SceneTable {
     /// Points in the order of the first dataset, best first; those that it lacks follow.
-    fn of(scenes: &[Scene]) -> Self {
+    fn new(scenes: &[SceneResults]) -> Self {
         let mut scores = vec!["psnr".to_owned(), "ssim".to_owned()];
-        let measures = || Measure::all().map(Measure::key);
-        let known = |key: &String| scenes.iter().any(|scene| scene.rows.scores.contains(key));
-        scores.extend(measures().filter(known));
-        let mut points: Vec<&Row> = vec![];
+        let measures = || LpipsVersion::all().map(LpipsVersion::key);
+        let is_scored = |key: &String| scenes.iter().any(|scene| scene.rows.scores.contains(key));
+        scores.extend(measures().filter(is_scored));
+        let mut points: Vec<&SweepRow> = vec![];
         for row in scenes.iter().flat_map(|scene| &scene.rows.rows) {
             if !points.iter().any(|point| point.point == row.point) {
                 points.push(row);
             }
         }
         let rows = points.into_iter().map(|point| {
-            let of_scene = |scene: &Scene| {
+            let of_scene = |scene: &SceneResults| {
                 let row = scene.rows.rows.iter().find(|row| row.point == point.point);
                 scores.iter().map(|score| row.and_then(|row| row.score(score))).collect()
             };
@@ -159,7 +159,7 @@ impl SceneTable {
         let titles: Vec<String> = self
             .scores
             .iter()
-            .map(|score| match Measure::all().find(|measure| measure.key() == *score) {
+            .map(|score| match LpipsVersion::all().find(|measure| measure.key() == *score) {
                 Some(measure) => measure.title(),
                 None => score.to_uppercase(),
             })

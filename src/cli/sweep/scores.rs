@@ -20,20 +20,20 @@ pub(super) const FILE: &str = "lpips.json";
 pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range) -> Result<()> {
     let key = Lpips::load(gpu, weights, range)?.measure().key();
     for run in runs {
-        let mut known = load(run);
-        if known["mean"].get(&key).is_some() {
+        let mut metrics = load(run);
+        if metrics["mean"].get(&key).is_some() {
             continue;
         }
         let FinishedRun { gpu, config, dataset, mut model_renderer, .. } =
             FinishedRun::open_lit(run, None, &driver::opener(None))?;
         let lpips = Lpips::load(&gpu, weights, range)?;
-        let mut reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
+        let mut reference = ScoreReference::new(&gpu, &config.tone, &dataset)?;
         let is_even = reference.is_evenly_lit(&dataset);
         let render = |view: &View| model_renderer.render_as(view, is_even);
         let extras = Extras { lpips: Some((&lpips, &gpu)), ..Extras::default() };
         let evaluation = Evaluation::new(&mut reference, &dataset, &extras, render, |_| Ok(()))?;
-        evaluation.add_lpips(&mut known);
-        let text = serde_json::to_string_pretty(&known)
+        evaluation.add_lpips(&mut metrics);
+        let text = serde_json::to_string_pretty(&metrics)
             .map_err(|error| Error::output(run.join(FILE), error.to_string()))?;
         write_whole(&run.join(FILE), text.as_bytes())?;
     }
@@ -43,14 +43,14 @@ pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range)
 /// What was measured of a run.
 fn load(folder: &Path) -> Value {
     let text = std::fs::read(folder.join(FILE)).ok();
-    let known = text.and_then(|text| serde_json::from_slice(&text).ok());
-    known.unwrap_or_else(|| json!({ "mean": {}, "views": {} }))
+    let metrics = text.and_then(|text| serde_json::from_slice(&text).ok());
+    metrics.unwrap_or_else(|| json!({ "mean": {}, "views": {} }))
 }
 
 /// Adds what was measured to the metrics of a run.
 pub(super) fn added(folder: &Path, mut metrics: Value) -> Value {
-    let known = load(folder);
-    for (key, value) in known["mean"].as_object().into_iter().flatten() {
+    let scored = load(folder);
+    for (key, value) in scored["mean"].as_object().into_iter().flatten() {
         metrics["mean"][key] = value.clone();
     }
     metrics

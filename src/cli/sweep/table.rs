@@ -1,10 +1,10 @@
 //! The table of a sweep: a row per point, columns of the numbers of its runs. The leaderboard and the costs are tables
 //! of different columns.
 
-use super::rows::{Row, Rows, number};
+use super::rows::{SweepResults, SweepRow, number};
 use crate::base::output::csv_field;
-use crate::networks::lpips::Measure;
-use crate::results::report::{Best, Column, Table};
+use crate::networks::lpips::LpipsVersion;
+use crate::results::report::{Best, Column, NumberTable};
 
 /// A number in `metrics.json` of a run.
 #[derive(Clone, Debug)]
@@ -46,7 +46,7 @@ impl Quantity {
             best,
             ..cost(&format!("/mean/{key}"), name, digits, 1.0)
         };
-        if let Some(measure) = Measure::all().find(|measure| measure.key() == key) {
+        if let Some(measure) = LpipsVersion::all().find(|measure| measure.key() == key) {
             return score(&measure.title(), 3, Best::Least);
         }
         if let Some(of_final) = key.strip_prefix("r0/").map(Self::new) {
@@ -68,14 +68,14 @@ impl Quantity {
     }
 
     /// The mean over the runs of a row, in the displayed unit.
-    pub(super) fn mean(&self, row: &Row) -> Option<f64> {
+    pub(super) fn mean(&self, row: &SweepRow) -> Option<f64> {
         Some(row.mean(&self.pointer)? / self.unit)
     }
 }
 
 /// What a column has of the runs of a row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Statistic {
+pub(super) enum ColumnStatistic {
     Mean,
     /// The sample standard deviation.
     Deviation,
@@ -89,33 +89,37 @@ pub(super) struct CsvColumn {
     cells: Vec<String>,
 }
 
-impl Rows {
+impl SweepResults {
     /// A table of these columns.
-    pub(super) fn table(&self, title: &str, columns: &[(Quantity, Statistic)]) -> Table {
+    pub(super) fn table(
+        &self,
+        title: &str,
+        columns: &[(Quantity, ColumnStatistic)],
+    ) -> NumberTable {
         let baseline = self.baseline();
-        let column = |(quantity, statistic): &(Quantity, Statistic)| {
+        let column = |(quantity, statistic): &(Quantity, ColumnStatistic)| {
             let Quantity { name, digits, best, .. } = quantity;
             let (name, best) = match statistic {
-                Statistic::Mean => (name.as_str(), *best),
-                Statistic::Deviation => ("sd", Best::Unmarked),
-                Statistic::Gain => ("gain", Best::Unmarked),
+                ColumnStatistic::Mean => (name.as_str(), *best),
+                ColumnStatistic::Deviation => ("sd", Best::Unmarked),
+                ColumnStatistic::Gain => ("gain", Best::Unmarked),
             };
             Column { name: name.to_owned(), digits: *digits, best }
         };
-        let value = |row: &Row, quantity: &Quantity, statistic| match statistic {
-            Statistic::Mean => quantity.mean(row),
-            Statistic::Deviation => Some(row.deviation(&quantity.pointer)? / quantity.unit),
-            Statistic::Gain => {
+        let value = |row: &SweepRow, quantity: &Quantity, statistic| match statistic {
+            ColumnStatistic::Mean => quantity.mean(row),
+            ColumnStatistic::Deviation => Some(row.deviation(&quantity.pointer)? / quantity.unit),
+            ColumnStatistic::Gain => {
                 let (base, _) = baseline.as_ref()?;
                 Some(quantity.mean(row)? - quantity.mean(base)?)
             }
         };
-        let row = |row: &Row| {
+        let row = |row: &SweepRow| {
             let values =
                 columns.iter().map(|(quantity, statistic)| value(row, quantity, *statistic));
             (self.label(row, None), values.collect())
         };
-        Table {
+        NumberTable {
             title: title.to_owned(),
             label: "point".to_owned(),
             columns: columns.iter().map(column).collect(),
@@ -138,7 +142,11 @@ impl Rows {
     }
 
     /// A column of CSV; `cell` takes the index of a row and the row.
-    pub(super) fn csv_column(&self, name: &str, cell: impl Fn(usize, &Row) -> String) -> CsvColumn {
+    pub(super) fn csv_column(
+        &self,
+        name: &str,
+        cell: impl Fn(usize, &SweepRow) -> String,
+    ) -> CsvColumn {
         let cells = self.rows.iter().enumerate().map(|(index, row)| cell(index, row));
         CsvColumn { name: name.to_owned(), cells: cells.collect() }
     }
@@ -149,7 +157,7 @@ impl Rows {
         let pointer = Quantity::new(key).pointer;
         let mut columns = vec![self.csv_column(key, |_, row| number(row.mean(&pointer)))];
         if with_deviation {
-            let cell = |_, row: &Row| number(row.deviation(&pointer));
+            let cell = |_, row: &SweepRow| number(row.deviation(&pointer));
             columns.push(self.csv_column(&format!("{key}_sd"), cell));
         }
         columns
@@ -162,7 +170,7 @@ mod tests {
 
     #[test]
     fn of_every_lpips_the_least_is_best() {
-        for measure in Measure::all() {
+        for measure in LpipsVersion::all() {
             let Quantity { name, best, .. } = Quantity::new(&measure.key());
             assert!(matches!(best, Best::Least) && name == measure.title(), "{name}");
         }

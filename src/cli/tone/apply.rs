@@ -9,11 +9,11 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use self::page::Page;
-use self::photographs::{Listed, listed};
+use self::page::TonePage;
+use self::photographs::{InputPhotograph, listed};
 use crate::base::output::{check_writable, create_folder, printable};
 use crate::cli::settings::{CurveOptions, Selection, SettingOptions};
-use crate::cli::{ImageFormat, driver, finish, progress_bar, table, word, words};
+use crate::cli::{OutputFormat, driver, finish, progress_bar, table, word, words};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
 use crate::photographs::image::{ColourCounts, Image, Mask, Orientation};
@@ -57,7 +57,7 @@ pub struct ApplyArgs {
     pub compare: Vec<CurveChoice>,
     /// Image format
     #[arg(long, value_enum, default_value_t)]
-    pub format: ImageFormat,
+    pub format: OutputFormat,
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the best]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
@@ -154,7 +154,7 @@ pub struct ToneOutput {
 }
 
 impl Measures {
-    fn of(planes: &[f32], statistics: &Statistics) -> Self {
+    fn new(planes: &[f32], statistics: &Statistics) -> Self {
         let mut distribution = Distribution::new("");
         distribution.add(planes);
         let clipped = planes.iter().filter(|&&value| value >= 1.0).count();
@@ -247,7 +247,8 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     let gpu = driver::open(&args.device.clone().unwrap_or_default())?;
     let mut set =
         CurveOnSet::new(&gpu, settings.clone(), &photographs, (&args.input, config.invert_masks))?;
-    let mut page = args.report.as_ref().map(|_| Page::new(&gpu, args, &photographs)).transpose()?;
+    let mut page =
+        args.report.as_ref().map(|_| TonePage::new(&gpu, args, &photographs)).transpose()?;
 
     let progress = progress_bar(photographs.len());
     let mut views = vec![];
@@ -274,7 +275,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
         progress.inc(1);
     }
     progress.finish_and_clear();
-    set.colours.say();
+    set.colours.log();
     let exposure = set.targets.scene.exposure;
     let Some(mut scene) = scene(&views) else {
         let nothing = || Error::input(&args.input, "contains no photograph");
@@ -304,7 +305,7 @@ impl CurveOnSet {
     fn new(
         gpu: &Gpu,
         settings: ToneSettings,
-        photographs: &[Listed],
+        photographs: &[InputPhotograph],
         (input, inverted): (&Path, bool),
     ) -> Result<Self> {
         let mut measured = vec![];
@@ -313,7 +314,7 @@ impl CurveOnSet {
                 // Unusable photographs are reported when they are mapped.
                 let unsaid = ColourCounts::default();
                 let Ok((photograph, gaps)) = loaded(listed, inverted, &unsaid) else { continue };
-                measured.push(MeasuredPhotograph::of(&without(&photograph, &gaps)));
+                measured.push(MeasuredPhotograph::measure(&without(&photograph, &gaps)));
             }
             if measured.is_empty() && settings.scene_statistics {
                 let problem =
@@ -339,14 +340,18 @@ impl CurveOnSet {
         photograph: &Image,
         gaps: &[usize],
     ) -> Result<(Statistics, Image, Option<f64>)> {
-        let measured = MeasuredPhotograph::of(&without(photograph, gaps));
+        let measured = MeasuredPhotograph::measure(&without(photograph, gaps));
         let image = self.targets.tone_mapped(photograph, &measured)?;
         Ok((measured.statistics, image, self.targets.scene.mapping_of(&measured).gain))
     }
 }
 
 /// A photograph and the indices of its unusable pixels.
-fn loaded(listed: &Listed, inverted: bool, colours: &ColourCounts) -> Result<(Image, Vec<usize>)> {
+fn loaded(
+    listed: &InputPhotograph,
+    inverted: bool,
+    colours: &ColourCounts,
+) -> Result<(Image, Vec<usize>)> {
     let (photograph, gaps) = listed.load(inverted, colours)?;
     let (photograph, gaps) = listed.turned(photograph, gaps);
     if gaps.len() == photograph.pixel_count() {
@@ -365,12 +370,12 @@ struct Mapped {
     reference: Option<Image>,
 }
 
-fn mapped(set: &mut CurveOnSet, listed: &Listed) -> Result<Mapped> {
+fn mapped(set: &mut CurveOnSet, listed: &InputPhotograph) -> Result<Mapped> {
     let (photograph, gaps) = loaded(listed, set.inverted, &set.colours)?;
     let load = |path: &PathBuf| {
         let image = Image::load_counted(path, &set.colours)?;
         let is_plain = listed.split.is_none();
-        Ok(if is_plain { image.turned(Orientation::of(path)) } else { image })
+        Ok(if is_plain { image.turned(Orientation::from_file(path)) } else { image })
     };
     let reference = listed.reference.as_ref().map(load).transpose()?;
     let (statistics, image, gain) = set.result(&photograph, &gaps)?;
@@ -378,17 +383,17 @@ fn mapped(set: &mut CurveOnSet, listed: &Listed) -> Result<Mapped> {
 }
 
 impl Mapped {
-    fn report(&self, settings: &ToneSettings, listed: &Listed) -> Result<ToneReport> {
+    fn report(&self, settings: &ToneSettings, listed: &InputPhotograph) -> Result<ToneReport> {
         let Self { photograph, gaps, statistics, image, gain, reference } = self;
         let (usable, result) = (without(photograph, gaps), without(image, gaps));
         let scores = reference.as_ref().map(|reference| {
             let size = |image: &Image| format!("{}x{}", image.width, image.height);
             if size(reference) != size(image) {
                 let path = listed.reference.as_deref().unwrap_or(&listed.input);
-                let (own, other) = (size(reference), size(image));
+                let (reference_size, other) = (size(reference), size(image));
                 // A wrong folder rather than a bad file: stop.
                 return Err(Error::Usage(format!(
-                    "{}: is {own} but {} is {other}; references must have the size of the photographs",
+                    "{}: is {reference_size} but {} is {other}; references must have the size of the photographs",
                     path.display(),
                     listed.input.display()
                 )));
@@ -399,10 +404,10 @@ impl Mapped {
         let alpha = if settings.alpha > 0.0 { settings.alpha } else { paper.alpha };
         let black_level = ToneSettings { alpha, ..settings.clone() };
         Ok(ToneReport {
-            before: Measures::of(&usable, statistics),
+            before: Measures::new(&usable, statistics),
             delta0: black_level.offset(statistics.printed_ratio()),
             unusable_pixels: gaps.len(),
-            after: Measures::of(&result, &Statistics::of(&result)),
+            after: Measures::new(&result, &Statistics::new(&result)),
             gain: *gain,
             scores: scores.transpose()?,
         })
@@ -420,11 +425,11 @@ fn without<'a>(image: &'a Image, gaps: &[usize]) -> std::borrow::Cow<'a, [f32]> 
 }
 
 /// Means over the views; `None` if empty.
-fn scene(views: &[(&Listed, ToneReport)]) -> Option<ToneReport> {
+fn scene(views: &[(&InputPhotograph, ToneReport)]) -> Option<ToneReport> {
     let in_split = |split: Split| {
         let chosen: Vec<ToneReport> = views
             .iter()
-            .filter(|(listed, _)| listed.split.is_none_or(|own| own == split))
+            .filter(|(listed, _)| listed.split.is_none_or(|wanted| wanted == split))
             .map(|(_, report)| *report)
             .collect();
         // If a split has no usable photograph, take all.

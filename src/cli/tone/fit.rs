@@ -10,7 +10,7 @@ use crate::base::output::{check_writable, write_whole};
 use crate::cli::table::aligned;
 use crate::cli::{finish, word};
 use crate::photographs::fit::{
-    Channels, Estimate, Fit, FitOptions, FitScene, HeldOut, Pair, Scores, Weighting,
+    Channels, CurveFit, CurveScores, Estimate, FitOptions, FitScene, HeldOut, Pair, Weighting,
     cross_validate, fit,
 };
 use crate::photographs::tone::{FAMILIES, Family, ToneCurve};
@@ -133,7 +133,7 @@ pub struct Fitted {
     /// Its formula.
     pub formula: &'static str,
     /// The fit to all pairs.
-    pub fit: Fit,
+    pub fit: CurveFit,
     /// Scores on pairs that were not fitted to.
     pub held_out: Option<HeldOut>,
 }
@@ -304,8 +304,8 @@ fn text(fitted: &[Fitted]) -> String {
         fit.values, fit.effective_values
     );
     if let Some(held_out) = held_out {
-        let row = |name: &str, pairs: usize, psnr: &Scores, squared_error: &Scores| {
-            let of = |scores: &Scores| [scores.fitted, scores.frozen, scores.ap3];
+        let row = |name: &str, pairs: usize, psnr: &CurveScores, squared_error: &CurveScores| {
+            let of = |scores: &CurveScores| [scores.fitted, scores.frozen, scores.ap3];
             let psnr = of(psnr).map(|score| format!("{score:.2}"));
             let rmse = of(squared_error).map(|error| format!("{:.4}", error.sqrt()));
             [vec![name.to_owned(), pairs.to_string()], psnr.to_vec(), rmse.to_vec()].concat()

@@ -47,7 +47,7 @@ const PLOTTED: [ToneCurve; 5] =
     [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Gamma, ToneCurve::Reinhard];
 
 /// A curve with its name.
-struct Curve {
+struct NamedCurve {
     name: String,
     settings: ToneSettings,
 }
@@ -88,11 +88,12 @@ fn auto_and(formulas: impl IntoIterator<Item = ToneCurve>) -> Vec<CurveChoice> {
     std::iter::once(Tone::Auto.into()).chain(formulas.into_iter().map(CurveChoice::from)).collect()
 }
 
-fn chosen(choices: &[CurveChoice]) -> Result<Vec<Curve>> {
+fn chosen(choices: &[CurveChoice]) -> Result<Vec<NamedCurve>> {
     let all = auto_and(ToneCurve::ALL);
     let choices = if choices.is_empty() { &all } else { choices };
-    let curve =
-        |choice: &CurveChoice| Ok(Curve { name: choice.to_string(), settings: choice.settings()? });
+    let curve = |choice: &CurveChoice| {
+        Ok(NamedCurve { name: choice.to_string(), settings: choice.settings()? })
+    };
     choices.iter().map(curve).collect()
 }
 
@@ -102,16 +103,16 @@ fn scene_statistics(root: &std::path::Path) -> Result<Statistics> {
     let training = photographs.iter().filter(|photograph| photograph.split == Split::Train);
     let colours = ColourCounts::default();
     let statistics = training.map(|photograph| {
-        Ok(Statistics::of(&Image::load_counted(&photograph.input, &colours)?.data))
+        Ok(Statistics::new(&Image::load_counted(&photograph.input, &colours)?.data))
     });
     let statistics = statistics.collect::<Result<Vec<_>>>()?;
-    colours.say();
+    colours.log();
     Statistics::mean_of(&statistics).ok_or_else(|| Error::input(root, "has no training photograph"))
 }
 
-fn listing(curves: &[Curve]) -> String {
+fn listing(curves: &[NamedCurve]) -> String {
     let mut text = String::new();
-    for Curve { name, settings } in curves {
+    for NamedCurve { name, settings } in curves {
         let what = match &settings.curve {
             Tone::Formula(_) => "",
             Tone::Auto => AUTO,
@@ -147,10 +148,10 @@ fn value(settings: &ToneSettings, t: f64, scene: Option<&Statistics>) -> f64 {
     settings.value(t, &scene.copied().unwrap_or_else(|| settings.plain_statistics()))
 }
 
-fn values(curves: &[Curve], at: &[f64], scene: Option<&Statistics>) -> String {
+fn values(curves: &[NamedCurve], at: &[f64], scene: Option<&Statistics>) -> String {
     let mut rows = vec![vec!["t".to_owned()]];
     rows[0].extend(at.iter().map(f64::to_string));
-    for Curve { name, settings } in curves {
+    for NamedCurve { name, settings } in curves {
         let mut row = vec![name.clone()];
         row.extend(at.iter().map(|&t| format!("{:.3}", value(settings, t, scene))));
         rows.push(row);
@@ -158,12 +159,12 @@ fn values(curves: &[Curve], at: &[f64], scene: Option<&Statistics>) -> String {
     table::aligned(&rows)
 }
 
-fn chart(curves: &[Curve], scene: Option<&Statistics>) -> Chart {
+fn chart(curves: &[NamedCurve], scene: Option<&Statistics>) -> Chart {
     const LAST: f64 = 3.0;
     const POINTS: u32 = 300;
     /// The most curves that can be told apart in a panel.
     const PANEL: usize = 6;
-    let series = |(index, curve): (usize, &Curve)| Series {
+    let series = |(index, curve): (usize, &NamedCurve)| Series {
         color: Some(index),
         name: curve.name.clone(),
         points: (0..=POINTS)

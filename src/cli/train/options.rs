@@ -6,7 +6,7 @@ use clap::Args;
 use toml::Value;
 
 use crate::cli::settings::{CurveOptions, Selection, SettingOptions, push_curve, push_dataset};
-use crate::cli::words::{self, Words};
+use crate::cli::words::{self, NamedValues};
 use crate::photographs::dataset::exclude;
 use crate::photographs::targets::SceneTone;
 use crate::train::diagnose::Plan;
@@ -56,7 +56,7 @@ struct SeveralSettings {
     #[arg(long, value_name = "FILE")]
     exclude_file: Option<PathBuf>,
     /// plain: 3DGS; lita: all parts of LITA-GS, with L1 alone on R_0 [default: plain]
-    #[arg(long, value_parser = Words::<ModelName>::new(["plain", "lita"]))]
+    #[arg(long, value_parser = NamedValues::<ModelName>::new(["plain", "lita"]))]
     model: Option<ModelName>,
     /// Parts of the model: any of denoiser, tonemapper, structure, depth
     #[arg(long, value_name = "LIST", value_delimiter = ',', value_parser = words::parts())]
@@ -179,8 +179,8 @@ impl SeveralSettings {
         let Some(path) = &self.frame else { return Ok(()) };
         for (key, value) in SettingsLayer::load(path)?.entries() {
             if !OF_FRAME.contains(&key) {
-                let known = OF_FRAME.join(", ");
-                return Err(Error::input(path, format!("sets {key}; a frame has {known} only")));
+                let keys = OF_FRAME.join(", ");
+                return Err(Error::input(path, format!("sets {key}; a frame has {keys} only")));
             }
             options.push(key, value.clone(), Origin::Option("--frame"))?;
         }

@@ -68,7 +68,7 @@ pub fn load(path: &Path) -> Result<Vec<KnownExposure>> {
         let all = COLUMNS.join(",");
         return Err(refused(format!("begins with `{header}`; its columns must be of {all}")));
     }
-    let (mut known, mut names) = (vec![], BTreeSet::new());
+    let (mut rows, mut names) = (vec![], BTreeSet::new());
     for (number, line) in lines {
         let exposure = parsed(&columns, line)
             .map_err(|problem| refused(format!("line {}: {problem}", number + 1)))?;
@@ -76,9 +76,9 @@ pub fn load(path: &Path) -> Result<Vec<KnownExposure>> {
             let problem = format!("line {}: `{}` occurs twice", number + 1, exposure.name);
             return Err(refused(problem));
         }
-        known.push(exposure);
+        rows.push(exposure);
     }
-    Ok(known)
+    Ok(rows)
 }
 
 /// Parses a line; a name may contain commas.
@@ -134,20 +134,20 @@ mod tests {
         let affine = Affine { gain: [0.7, 1.0 / 3.0, 2.5], bias: [0.125, -1e-7, 0.0] };
         let exposures = [("a, b".to_owned(), affine), ("c".to_owned(), Affine::IDENTITY)];
         save(&path, &exposures).unwrap();
-        let known = load(&path).unwrap();
-        for ((name, affine), known) in exposures.iter().zip(&known) {
-            assert_eq!((name, Some(*affine)), (&known.name, known.affine));
+        let read_rows = load(&path).unwrap();
+        for ((name, affine), read_rows) in exposures.iter().zip(&read_rows) {
+            assert_eq!((name, Some(*affine)), (&read_rows.name, read_rows.affine));
         }
-        assert_eq!(known[1].ev, Some(0.0));
+        assert_eq!(read_rows[1].ev, Some(0.0));
     }
 
     #[test]
     fn cells_may_be_empty_and_columns_omitted() {
-        let known = read("name,ev\nb.JPG, -1.5\n\na,\n").unwrap();
-        assert_eq!((known[0].name.as_str(), known[0].ev, known[0].affine), ("b", Some(-1.5), None));
-        assert_eq!((known[1].name.as_str(), known[1].ev), ("a", None));
-        let known = read("name,gain_r,gain_g,gain_b\na,1,2,3\n").unwrap();
-        assert_eq!(known[0].affine, Some(Affine { gain: [1.0, 2.0, 3.0], bias: [0.0; 3] }));
+        let rows = read("name,ev\nb.JPG, -1.5\n\na,\n").unwrap();
+        assert_eq!((rows[0].name.as_str(), rows[0].ev, rows[0].affine), ("b", Some(-1.5), None));
+        assert_eq!((rows[1].name.as_str(), rows[1].ev), ("a", None));
+        let rows = read("name,gain_r,gain_g,gain_b\na,1,2,3\n").unwrap();
+        assert_eq!(rows[0].affine, Some(Affine { gain: [1.0, 2.0, 3.0], bias: [0.0; 3] }));
     }
 
     #[test]

@@ -12,20 +12,20 @@ use crate::kernels::{ssim, ssim_backward, ssim_forward};
 
 /// The gradient of L1 + SSIM, and their partial sums or, where the last kernel writes it, their row of the log.
 #[derive(Debug)]
-pub(super) struct Ssim {
+pub(super) struct SsimLoss {
     /// w, above 0.
     weight: f64,
     lanes: u32,
-    kernels: Kernels,
+    kernels: SsimKernels,
 }
 
 /// The kernels for the device. On a CPU, loads and stores cost most, and the state of both blurs fits the L1 cache. On
 /// a GPU it would take most registers of a processor, so that too few subgroups would be left to hide latencies.
 #[derive(Debug)]
 #[expect(clippy::large_enum_variant, reason = "a training has one")]
-enum Kernels {
+enum SsimKernels {
     /// The first layout that fits a view is used; the last one fits every view.
-    One(Vec<(Layout, Pipeline<ssim::Kernel>)>),
+    One(Vec<(SsimLayout, Pipeline<ssim::Kernel>)>),
     Two {
         forward: Pipeline<ssim_forward::Kernel>,
         backward: Pipeline<ssim_backward::Kernel>,
@@ -39,15 +39,15 @@ enum Kernels {
 /// The layout of the one kernel: columns per lane, rows per subgroup, and the alignment of its loads and stores in
 /// floats. A subgroup is as wide as its state fits the cache, and has many rows.
 #[derive(Clone, Copy, Debug)]
-struct Layout {
+struct SsimLayout {
     columns: u32,
     rows: u32,
     alignment: u32,
 }
 
-const LAYOUTS: [Layout; 2] = [
-    Layout { columns: 12, rows: 192, alignment: 4 },
-    Layout { columns: 10, rows: 192, alignment: 1 },
+const LAYOUTS: [SsimLayout; 2] = [
+    SsimLayout { columns: 12, rows: 192, alignment: 4 },
+    SsimLayout { columns: 10, rows: 192, alignment: 1 },
 ];
 
 /// The subgroups that occupy the largest GPUs: 24 on each of some 130 multiprocessors. With more, each would have fewer
@@ -56,7 +56,7 @@ const SUBGROUPS: u64 = 3072;
 /// The fewest and the most rows of a subgroup.
 const ROWS: [u64; 2] = [8, 128];
 
-impl Layout {
+impl SsimLayout {
     fn fits(self, size: UVec2) -> bool {
         size.x.is_multiple_of(self.alignment)
     }
@@ -76,23 +76,23 @@ fn rows(size: UVec2, lanes: u32) -> u32 {
 }
 
 fn layout_of(
-    kernels: &[(Layout, Pipeline<ssim::Kernel>)],
+    kernels: &[(SsimLayout, Pipeline<ssim::Kernel>)],
     size: UVec2,
-) -> &(Layout, Pipeline<ssim::Kernel>) {
+) -> &(SsimLayout, Pipeline<ssim::Kernel>) {
     let first = kernels.iter().position(|(layout, _)| layout.fits(size));
     &kernels[first.unwrap_or(kernels.len() - 1)]
 }
 
-impl Ssim {
+impl SsimLoss {
     /// Builds the kernels; `adds`: the gradient is added to that of earlier terms.
     pub(super) fn new(gpu: &Gpu, weight: f64, adds: bool) -> Result<Self> {
         let kernel = |layout| {
-            let Layout { columns, rows, alignment } = layout;
+            let SsimLayout { columns, rows, alignment } = layout;
             Ok((layout, gpu.pipeline(&ssim::Constants { columns, rows, alignment, adds })?))
         };
         let kernels = match gpu.properties().is_cpu {
-            true => Kernels::One(LAYOUTS.into_iter().map(kernel).collect::<Result<_>>()?),
-            false => Kernels::Two {
+            true => SsimKernels::One(LAYOUTS.into_iter().map(kernel).collect::<Result<_>>()?),
+            false => SsimKernels::Two {
                 forward: gpu.pipeline(&ssim_forward::Constants::default())?,
                 backward: gpu.pipeline(&ssim_backward::Constants { adds })?,
                 derivatives: [
@@ -108,15 +108,15 @@ impl Ssim {
 
     /// Allocates scratch memory for views of up to `values` values; it never shrinks.
     pub(super) fn reserve(&mut self, gpu: &Gpu, values: u32) -> Result<()> {
-        let Kernels::Two { derivatives, .. } = &mut self.kernels else { return Ok(()) };
+        let SsimKernels::Two { derivatives, .. } = &mut self.kernels else { return Ok(()) };
         derivatives.iter_mut().try_for_each(|buffer| buffer.grow(gpu, values as usize))
     }
 
     /// Subgroups, one per workgroup, and so the partial sums of a view.
     pub(super) fn workgroups(&self, size: UVec2) -> u32 {
         3 * match &self.kernels {
-            Kernels::One(kernels) => layout_of(kernels, size).0.subgroups(size, self.lanes),
-            Kernels::Two { .. } => {
+            SsimKernels::One(kernels) => layout_of(kernels, size).0.subgroups(size, self.lanes),
+            SsimKernels::Two { .. } => {
                 size.x.div_ceil(self.lanes) * size.y.div_ceil(rows(size, self.lanes))
             }
         }
@@ -140,7 +140,7 @@ impl Ssim {
         let (UVec2 { x: width, y: height }, rows) = (size, rows(size, self.lanes));
         let (loss_begin, loss_end) = (loss_region.origin, loss_region.end());
         let (forward, backward, [d_mean, d_square, d_product], arrivals) = match &mut self.kernels {
-            Kernels::One(kernels) => {
+            SsimKernels::One(kernels) => {
                 pass.dispatch(
                     &layout_of(kernels, size).1,
                     &ssim::Params { width, height, loss_begin, loss_end, l1_scale, ssim_scale },
@@ -155,7 +155,7 @@ impl Ssim {
                 )?;
                 return Ok(false);
             }
-            Kernels::Two { forward, backward, derivatives, arrivals } => {
+            SsimKernels::Two { forward, backward, derivatives, arrivals } => {
                 (forward, backward, derivatives, arrivals)
             }
         };

@@ -167,7 +167,7 @@ impl EarlierStages {
     }
 
     /// The activations of stage `k` in a view of this extent: its own if they are kept, else the shared ones.
-    pub(super) fn of<'a>(
+    pub(super) fn activations<'a>(
         &'a mut self,
         k: usize,
         extent: Extent,

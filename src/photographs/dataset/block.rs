@@ -8,7 +8,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use super::Point;
-use super::listing::ListedView;
+use super::listing::ViewEntry;
 use crate::base::{input, output, tree};
 use crate::{Error, Result};
 
@@ -121,7 +121,7 @@ impl Block {
     }
 
     /// Keeps the views of the block, with their splits in the dataset.
-    pub(super) fn restrict(&self, frames: &mut Vec<ListedView>) -> Result<()> {
+    pub(super) fn restrict(&self, frames: &mut Vec<ViewEntry>) -> Result<()> {
         let wanted: BTreeSet<&str> = self.views.iter().map(String::as_str).collect();
         frames.retain(|frame| wanted.contains(frame.name.as_str()));
         if frames.len() == wanted.len() {

@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use super::source::{Source, shown};
+use super::source::{ViewFiles, shown};
 use super::{Photograph, Split};
 use crate::photographs::image::{Image, Mask, PictureFile};
 
@@ -37,20 +37,20 @@ const REACH: usize = 2;
 pub(crate) struct Borders(BTreeMap<(u32, u32), Vec<usize>>);
 
 /// A training photograph without a mask: who has masks has masked what shows nothing.
-struct Candidate<'a> {
+struct BorderCandidate<'a> {
     size: (u32, u32),
     picture: Box<dyn Fn() -> Option<Image> + 'a>,
 }
 
 impl Borders {
-    pub(super) fn of_sources<'a>(sources: impl Iterator<Item = &'a Source>) -> Self {
+    pub(super) fn of_sources<'a>(sources: impl Iterator<Item = &'a ViewFiles>) -> Self {
         let sources =
             sources.filter(|source| source.split == Split::Train && source.mask.is_none());
         Self::find(sources.map(|source| {
             let size = source.read[0].as_ref().and_then(|file| file.size().ok());
             let size = size.or_else(|| Image::size_of(source.input.as_deref()?).ok());
             let picture = Box::new(|| source.picture());
-            Candidate { size: size.unwrap_or_default(), picture }
+            BorderCandidate { size: size.unwrap_or_default(), picture }
         }))
     }
 
@@ -60,12 +60,12 @@ impl Borders {
             photographs.iter().filter(|one| one.split == Split::Train && one.mask.is_none());
         Self::find(training.map(|Photograph { input, .. }| {
             let picture = Box::new(|| shown(PictureFile::open(input).ok()?));
-            Candidate { size: Image::size_of(input).unwrap_or_default(), picture }
+            BorderCandidate { size: Image::size_of(input).unwrap_or_default(), picture }
         }))
     }
 
-    fn find<'a>(candidates: impl Iterator<Item = Candidate<'a>>) -> Self {
-        let mut by_size: BTreeMap<(u32, u32), Vec<Candidate<'_>>> = BTreeMap::new();
+    fn find<'a>(candidates: impl Iterator<Item = BorderCandidate<'a>>) -> Self {
+        let mut by_size: BTreeMap<(u32, u32), Vec<BorderCandidate<'_>>> = BTreeMap::new();
         candidates.for_each(|one| by_size.entry(one.size).or_default().push(one));
         by_size.retain(|_, candidates| candidates.len() >= NEEDED);
         let found = by_size.into_iter().filter_map(|(size, candidates)| {
@@ -84,14 +84,14 @@ impl Borders {
     }
 
     /// The mask of a photograph of this size, as stored, with its border masked as well.
-    pub(crate) fn hidden_too(&self, mask: Option<Mask>, size: (u32, u32)) -> Option<Mask> {
+    pub(crate) fn hide_borders(&self, mask: Option<Mask>, size: (u32, u32)) -> Option<Mask> {
         Mask::masked_at(mask, size, self.0.get(&size).map_or(&[], Vec::as_slice))
     }
 }
 
 /// The black border that images of one size have in common.
 fn border(images: impl Iterator<Item = Image>, (width, height): (u32, u32)) -> Option<Vec<usize>> {
-    let plane = Plane { width: width as usize, height: height as usize };
+    let plane = PixelGrid { width: width as usize, height: height as usize };
     let least = (LEAST_AREA * plane.len() as f64).ceil().max(1.0) as usize;
     let mut counts = vec![0_u16; plane.len()];
     let (mut brightness, mut areas) = (vec![], vec![]);
@@ -150,12 +150,12 @@ fn brightest(image: &Image) -> Vec<f32> {
 }
 
 /// Pixels of an image by their index.
-struct Plane {
+struct PixelGrid {
     width: usize,
     height: usize,
 }
 
-impl Plane {
+impl PixelGrid {
     fn len(&self) -> usize {
         self.width * self.height
     }

@@ -74,41 +74,41 @@ pub(super) fn largest(
 /// The lenses by camera id.
 pub(super) fn read_cameras(folder: &Path) -> Result<BTreeMap<u32, Lens>> {
     match required(folder, "cameras")? {
-        Encoded::Binary(path) => binary::cameras(&path),
-        Encoded::Text(path) => text::cameras(&path),
+        ColmapFile::Binary(path) => binary::cameras(&path),
+        ColmapFile::Text(path) => text::cameras(&path),
     }
 }
 
 /// The registered photographs, in file order.
 pub(super) fn read_images(folder: &Path) -> Result<Vec<ModelImage>> {
     match required(folder, "images")? {
-        Encoded::Binary(path) => binary::images(&path),
-        Encoded::Text(path) => text::images(&path),
+        ColmapFile::Binary(path) => binary::images(&path),
+        ColmapFile::Text(path) => text::images(&path),
     }
 }
 
 /// The points with finite positions, by id; both encodings give the same order.
 pub(super) fn read_points(folder: &Path) -> Result<Vec<ModelPoint>> {
     let points = match required(folder, "points3D")? {
-        Encoded::Binary(path) => binary::points(&path)?,
-        Encoded::Text(path) => text::points(&path)?,
+        ColmapFile::Binary(path) => binary::points(&path)?,
+        ColmapFile::Text(path) => text::points(&path)?,
     };
     Ok(points.into_values().filter(|point| point.position.is_finite()).collect())
 }
 
-enum Encoded {
+enum ColmapFile {
     Binary(PathBuf),
     Text(PathBuf),
 }
 
-fn file(folder: &Path, stem: &str) -> Option<Encoded> {
+fn file(folder: &Path, stem: &str) -> Option<ColmapFile> {
     let path = |extension| {
         Some(folder.join(stem).with_extension(extension)).filter(|path| tree::is_file(path))
     };
-    path("bin").map(Encoded::Binary).or_else(|| path("txt").map(Encoded::Text))
+    path("bin").map(ColmapFile::Binary).or_else(|| path("txt").map(ColmapFile::Text))
 }
 
-fn required(folder: &Path, stem: &str) -> Result<Encoded> {
+fn required(folder: &Path, stem: &str) -> Result<ColmapFile> {
     file(folder, stem)
         .ok_or_else(|| Error::input(folder, format!("has neither {stem}.bin nor {stem}.txt")))
 }

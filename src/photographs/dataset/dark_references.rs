@@ -1,6 +1,6 @@
 //! Detects reference images that are dark photographs of another split.
 
-use super::loaded::Loaded;
+use super::loaded::LoadedView;
 use super::{LoadOptions, Split};
 
 /// A photograph whose encoded mean is at most this is dark.
@@ -9,9 +9,9 @@ const DARK: f32 = 0.25;
 const BRIGHTER: f32 = 1.3;
 
 /// Turns reference images that are as dark as the photographs into photographs, with a warning.
-pub(super) fn drop_from(loaded: &mut [Loaded], options: &LoadOptions) {
+pub(super) fn drop_from(loaded: &mut [LoadedView], options: &LoadOptions) {
     let is_trained_on =
-        |loaded: &&Loaded| loaded.view.as_ref().is_some_and(|view| view.split == Split::Train);
+        |loaded: &&LoadedView| loaded.view.as_ref().is_some_and(|view| view.split == Split::Train);
     let photographs = loaded.iter().filter(is_trained_on).filter_map(|loaded| loaded.brightness[0]);
     let references = loaded.iter().filter_map(|loaded| loaded.brightness[1]);
     let (photographs, references) = (median(photographs.collect()), median(references.collect()));
@@ -20,7 +20,7 @@ pub(super) fn drop_from(loaded: &mut [Loaded], options: &LoadOptions) {
         return;
     }
     let mut dropped = vec![];
-    for Loaded { name, view, reference: file, .. } in loaded {
+    for LoadedView { name, view, reference: file, .. } in loaded {
         let Some(view) = view.as_mut().filter(|view| view.has_reference()) else { continue };
         let (image, kept_file) = (view.reference.take(), view.reference_file.take());
         if !view.has_photograph() && options.load_low_test {

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glob::Pattern;
 
-use super::listing::ListedView;
+use super::listing::ViewEntry;
 use crate::base::input;
 use crate::photographs::image::files::stem;
 use crate::{Error, Result};
@@ -32,15 +32,11 @@ pub(crate) fn patterns_of(path: &Path) -> Result<Vec<String>> {
 
 /// Removes the views that a pattern matches: their name, their file name, or their path as listed. Other views keep
 /// their split.
-pub(super) fn exclude(
-    root: &Path,
-    frames: &mut Vec<ListedView>,
-    patterns: &[String],
-) -> Result<()> {
+pub(super) fn exclude(root: &Path, frames: &mut Vec<ViewEntry>, patterns: &[String]) -> Result<()> {
     for text in patterns {
         // Invalid patterns are refused where they are set.
         let Ok(pattern) = Pattern::new(text) else { continue };
-        let matches = |frame: &ListedView| {
+        let matches = |frame: &ViewEntry| {
             let listed = frame.listed.replace('\\', "/");
             let file = listed.rsplit('/').next().unwrap_or_default();
             [frame.name.as_str(), stem(file), file, &listed]

@@ -21,7 +21,7 @@ pub struct Fingerprint {
 
 impl Fingerprint {
     /// Reads every pixel once.
-    pub fn of(dataset: &Dataset) -> Result<Self> {
+    pub fn compute(dataset: &Dataset) -> Result<Self> {
         let views = dataset.views.par_iter().filter(|view| view.is_for_training());
         let views = views
             .map(|view| Ok((view.name.clone(), [camera(view), pixels(view)?].map(hash::text))));
@@ -81,9 +81,9 @@ fn camera(View { camera, .. }: &View) -> u64 {
 fn pixels(view: &View) -> Result<u64> {
     // The checksum of a photograph that is not kept was computed while it was decoded.
     let not_kept = view.original.as_ref().filter(|_| view.image.is_none());
-    let known = not_kept.and_then(Original::checksum);
-    let image = if known.is_some() { None } else { view.loaded()? };
-    let mut hasher = known.unwrap_or_default();
+    let recorded = not_kept.and_then(Original::checksum);
+    let image = if recorded.is_some() { None } else { view.loaded()? };
+    let mut hasher = recorded.unwrap_or_default();
     for numbers in image.iter().map(|image| &image.data).chain(&view.depth) {
         hasher.write(bytemuck::cast_slice(numbers));
     }

@@ -10,7 +10,7 @@ use crate::{Error, Result};
 
 /// A dataset's folder and the listing of its photographs.
 #[derive(Clone, Debug)]
-pub(super) struct Layout {
+pub(super) struct DatasetLayout {
     /// The folder that paths are relative to.
     pub(super) root: PathBuf,
     /// The COLMAP model that the user named, if any.
@@ -34,14 +34,14 @@ const MODEL_FOLDERS: [&str; 8] = [
 /// How far above a model its photographs may be: `distorted/sparse/0`.
 const MOST_ABOVE: usize = 3;
 
-impl Layout {
+impl DatasetLayout {
     /// The layout of a path that a user gives: a dataset's folder or archive, its transforms file, its COLMAP model, or
     /// a block of it.
-    pub(super) fn of(given: &Path) -> Result<Self> {
+    pub(super) fn detect(given: &Path) -> Result<Self> {
         tree::check(given)
             .map_err(|error| Error::input(given, format!("cannot be read: {error}")))?;
         if let Some(block) = Block::at(given)? {
-            let layout = Self::of(&block.dataset)?;
+            let layout = Self::detect(&block.dataset)?;
             return Ok(Self { block: Some(block), ..layout });
         }
         let ending = given.extension().unwrap_or_default().to_ascii_lowercase();
@@ -65,7 +65,7 @@ impl Layout {
         if tree::archive_of(given) == Some(given)
             && let [only] = folders_in(given).as_slice()
         {
-            return Self::of(only);
+            return Self::detect(only);
         }
         Ok(layout.above_model().unwrap_or(layout))
     }
@@ -80,12 +80,12 @@ impl Layout {
         if let Some(folder) = &self.named {
             return colmap::models_in(folder, needed);
         }
-        let known = MODEL_FOLDERS.iter().map(|folder| match *folder {
+        let candidates = MODEL_FOLDERS.iter().map(|folder| match *folder {
             "" => colmap::model_in(&self.root, needed).into_iter().collect(),
             folder => colmap::models_in(&self.root.join(folder), needed),
         });
-        let mut known = known.filter(|models: &Vec<PathBuf>| !models.is_empty());
-        known.next().unwrap_or_else(|| {
+        let mut candidates = candidates.filter(|models: &Vec<PathBuf>| !models.is_empty());
+        candidates.next().unwrap_or_else(|| {
             // A folder of any name; one that also contains photographs is a separate dataset.
             let bare = folders_in(&self.root).into_iter().filter(|folder| !has_photographs(folder));
             bare.filter_map(|folder| colmap::model_in(&folder, needed)).collect()

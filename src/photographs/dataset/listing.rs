@@ -6,19 +6,19 @@ use std::path::{Path, PathBuf};
 use glam::DAffine3;
 
 use super::exclude::exclude;
-use super::layout::{CAMERAS, Layout};
+use super::layout::{CAMERAS, DatasetLayout};
 use super::locate::{self, Wanted};
 use super::ply::Cloud;
 use super::split::split;
 use super::{LoadOptions, Split, colmap, names, transforms, unused};
 use crate::camera::Lens;
 use crate::photographs::image::MaskFile;
-use crate::photographs::image::files::{self, Files};
+use crate::photographs::image::files::{self, PhotographFiles};
 use crate::{Error, Result};
 
 /// One view as a listing describes it, before any pixel is read.
 #[derive(Clone, Debug)]
-pub(super) struct ListedView {
+pub(super) struct ViewEntry {
     pub(super) name: String,
     /// Path as listed, relative to the root; if the photograph was found elsewhere, that path.
     pub(super) listed: String,
@@ -39,7 +39,7 @@ pub(super) struct ListedView {
 
 #[derive(Debug, Default)]
 pub(super) struct Listing {
-    pub(super) frames: Vec<ListedView>,
+    pub(super) frames: Vec<ViewEntry>,
     pub(super) skipped: Vec<String>,
     /// Choices that were made, and unused files; one line each.
     pub(super) remarks: Vec<String>,
@@ -50,7 +50,11 @@ pub(super) struct Listing {
 }
 
 /// The views that the options select, split, by name.
-pub(super) fn select(layout: &Layout, options: &LoadOptions, files: &Files) -> Result<Listing> {
+pub(super) fn select(
+    layout: &DatasetLayout,
+    options: &LoadOptions,
+    files: &PhotographFiles,
+) -> Result<Listing> {
     let mut listing = list(layout, options.images.as_deref(), files)?;
     split(&layout.root, &mut listing.frames, options.test_every, files)?;
     exclude(&layout.root, &mut listing.frames, &options.exclude)?;
@@ -61,7 +65,7 @@ pub(super) fn select(layout: &Layout, options: &LoadOptions, files: &Files) -> R
 }
 
 /// The views by name, which is unique; their photographs are searched in `images` if given.
-fn list(layout: &Layout, images: Option<&Path>, files: &Files) -> Result<Listing> {
+fn list(layout: &DatasetLayout, images: Option<&Path>, files: &PhotographFiles) -> Result<Listing> {
     let root = layout.root.as_path();
     let mut listing = Listing::default();
     let listings = layout.listings();
@@ -90,9 +94,9 @@ pub(super) fn warn(remarks: &[String]) {
 }
 
 fn list_colmap(
-    layout: &Layout,
+    layout: &DatasetLayout,
     images: Option<&Path>,
-    files: &Files,
+    files: &PhotographFiles,
     listing: &mut Listing,
 ) -> Result<()> {
     let root = layout.root.as_path();
@@ -136,7 +140,7 @@ fn list_colmap(
             listing.skipped.push(format!("{name}: its pose is not finite"));
             continue;
         };
-        listing.frames.push(ListedView {
+        listing.frames.push(ViewEntry {
             name: names::normalized(files::stem(&name)),
             listed: found.listed,
             below: found.below,
@@ -151,7 +155,7 @@ fn list_colmap(
     Ok(())
 }
 
-fn refuse_two_of_one_name(root: &Path, frames: &[ListedView]) -> Result<()> {
+fn refuse_two_of_one_name(root: &Path, frames: &[ViewEntry]) -> Result<()> {
     let mut listed = HashMap::new();
     for frame in frames {
         if let Some(other) = listed.insert(&frame.name, &frame.listed) {

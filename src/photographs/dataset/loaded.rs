@@ -4,7 +4,7 @@ use super::View;
 use super::original::Original;
 
 /// A decoded view.
-pub(super) struct Loaded {
+pub(super) struct LoadedView {
     pub(super) name: String,
     /// `None` for a training view whose photograph cannot be decoded.
     pub(super) view: Option<View>,

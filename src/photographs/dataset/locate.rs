@@ -9,7 +9,7 @@ use super::listing::Listing;
 use super::names::below_first;
 use crate::base::tree;
 use crate::photographs::image::MaskFile;
-use crate::photographs::image::files::{Files, is_hidden};
+use crate::photographs::image::files::{PhotographFiles, is_hidden};
 
 /// A listed photograph.
 pub(super) struct Wanted {
@@ -23,7 +23,7 @@ pub(super) struct Wanted {
 
 /// The location of a photograph.
 #[derive(Clone, Debug)]
-pub(super) struct Found {
+pub(super) struct PhotographPath {
     /// Relative to the root; as listed if the file is missing or outside.
     pub(super) listed: String,
     /// Path relative to the common folder of all photographs.
@@ -58,13 +58,14 @@ pub(super) fn photographs(
     root: &Path,
     images: Option<&Path>,
     wanted: Vec<Wanted>,
-    files: &Files,
+    files: &PhotographFiles,
     listing: &mut Listing,
-) -> Vec<Found> {
+) -> Vec<PhotographPath> {
     if let Some(folder) = images {
         return wanted.into_iter().map(|wanted| in_folder(root, folder, &wanted, files)).collect();
     }
-    let mut found: Vec<Found> = wanted.iter().map(|wanted| at_path(root, wanted, files)).collect();
+    let mut found: Vec<PhotographPath> =
+        wanted.iter().map(|wanted| at_path(root, wanted, files)).collect();
     let is_absent = |at: &usize| found[*at].file.is_none();
     let absent: Vec<usize> = (0..found.len()).filter(is_absent).collect();
     if absent.iter().any(|&at| !wanted[at].is_test) {
@@ -101,7 +102,7 @@ pub(super) fn photographs(
 }
 
 /// Resolves the masks and depth maps of a listing; reports missing ones.
-pub(super) fn beside(root: &Path, files: &Files, listing: &mut Listing) {
+pub(super) fn beside(root: &Path, files: &PhotographFiles, listing: &mut Listing) {
     let Listing { frames, remarks, .. } = listing;
     let folders = folders_below(root, &[]);
     let find = |kind: &str, listed: &Path, photograph: Option<&PathBuf>| {
@@ -142,7 +143,7 @@ pub(super) fn beside(root: &Path, files: &Files, listing: &mut Listing) {
 }
 
 /// At the listed path.
-fn at_path(root: &Path, wanted: &Wanted, files: &Files) -> Found {
+fn at_path(root: &Path, wanted: &Wanted, files: &PhotographFiles) -> PhotographPath {
     for folder in &wanted.folders {
         if let Some(file) = files.find(folder, &wanted.path) {
             let folder = relative(root, folder);
@@ -151,7 +152,7 @@ fn at_path(root: &Path, wanted: &Wanted, files: &Files) -> Found {
             } else {
                 format!("{folder}/{}", wanted.path)
             };
-            return Found { below: below(wanted), listed, file: Some(file) };
+            return PhotographPath { below: below(wanted), listed, file: Some(file) };
         }
     }
     let is_elsewhere = wanted.path.starts_with('/') || wanted.path.contains(':');
@@ -159,7 +160,7 @@ fn at_path(root: &Path, wanted: &Wanted, files: &Files) -> Found {
         Some(folder) if !is_elsewhere => format!("{}/{}", relative(root, folder), wanted.path),
         _ => wanted.path.clone(),
     };
-    Found { below: below(wanted), listed, file: None }
+    PhotographPath { below: below(wanted), listed, file: None }
 }
 
 /// The part of a listed path below the folder of all photographs: listings of several locations use it as a name.
@@ -169,7 +170,12 @@ fn below(wanted: &Wanted) -> String {
 }
 
 /// In a folder given by the user.
-fn in_folder(root: &Path, folder: &Path, wanted: &Wanted, files: &Files) -> Found {
+fn in_folder(
+    root: &Path,
+    folder: &Path,
+    wanted: &Wanted,
+    files: &PhotographFiles,
+) -> PhotographPath {
     let path = wanted.path.as_str();
     let name = path.rsplit('/').next().unwrap_or(path);
     let found = [path, below_first(path), name]
@@ -177,17 +183,17 @@ fn in_folder(root: &Path, folder: &Path, wanted: &Wanted, files: &Files) -> Foun
         .find_map(|rest| Some((rest, files.find(folder, rest)?)));
     match found {
         Some((rest, file)) => moved(root, folder, rest, file),
-        None => Found { below: below(wanted), listed: wanted.path.clone(), file: None },
+        None => PhotographPath { below: below(wanted), listed: wanted.path.clone(), file: None },
     }
 }
 
-fn moved(root: &Path, folder: &Path, rest: &str, file: PathBuf) -> Found {
+fn moved(root: &Path, folder: &Path, rest: &str, file: PathBuf) -> PhotographPath {
     let below_root = relative(root, folder);
     let (listed, below) = match below_root.as_str() {
         "." => (rest.to_owned(), below_first(rest).to_owned()),
         below_root => (format!("{below_root}/{rest}"), rest.to_owned()),
     };
-    Found { listed, below, file: Some(file) }
+    PhotographPath { listed, below, file: Some(file) }
 }
 
 fn relative(root: &Path, folder: &Path) -> String {
@@ -208,7 +214,12 @@ enum Elsewhere {
 }
 
 /// The folder below the root that contains files of the same names.
-fn elsewhere(root: &Path, paths: &[&str], used: &HashSet<PathBuf>, files: &Files) -> Elsewhere {
+fn elsewhere(
+    root: &Path,
+    paths: &[&str],
+    used: &HashSet<PathBuf>,
+    files: &PhotographFiles,
+) -> Elsewhere {
     let folders = folders_below(root, &OTHERS);
     let mut candidates = best(&folders, &rests(paths), used, files);
     let rank = |folder: &Path| {
@@ -237,7 +248,7 @@ fn best(
     folders: &[PathBuf],
     ways: &[Vec<String>],
     used: &HashSet<PathBuf>,
-    files: &Files,
+    files: &PhotographFiles,
 ) -> Vec<(PathBuf, Rests)> {
     for way in ways {
         let mut most = way.len().div_ceil(2).max(1);

@@ -3,9 +3,9 @@
 
 use std::path::Path;
 
-use super::listing::ListedView;
+use super::listing::ViewEntry;
 use crate::photographs::image::MaskFile;
-use crate::photographs::image::files::Files;
+use crate::photographs::image::files::PhotographFiles;
 
 /// The folder of masks below the root.
 const FOLDER: &str = "masks";
@@ -13,7 +13,7 @@ const FOLDER: &str = "masks";
 const MOVING: &str = "dynamic_mask_";
 
 /// The mask of a photograph.
-pub(super) fn find(root: &Path, frame: &ListedView, files: &Files) -> Option<MaskFile> {
+pub(super) fn find(root: &Path, frame: &ViewEntry, files: &PhotographFiles) -> Option<MaskFile> {
     if frame.mask.is_some() {
         return frame.mask.clone();
     }
@@ -26,7 +26,7 @@ pub(super) fn find(root: &Path, frame: &ListedView, files: &Files) -> Option<Mas
 }
 
 /// The mask of moving objects.
-fn moving(frame: &ListedView, files: &Files) -> Option<MaskFile> {
+fn moving(frame: &ViewEntry, files: &PhotographFiles) -> Option<MaskFile> {
     let file = frame.file.as_ref()?;
     let name = file.file_name()?.to_str()?;
     let path = files.find(file.parent()?, &format!("{MOVING}{name}"))?;

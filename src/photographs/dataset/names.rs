@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use super::listing::ListedView;
+use super::listing::ViewEntry;
 pub(super) use crate::photographs::image::files::normalized;
 use crate::photographs::image::files::stem;
 
@@ -28,20 +28,19 @@ pub(super) fn possible(path: &str) -> [String; 3] {
 /// Adds folders to all names if two photographs in different folders have the same name: the path below the folder of
 /// all photographs, or the complete path if that is ambiguous as well (`train/r_0`, `test/r_0`). With one pose they are
 /// one photograph that is listed twice (`low/0`, `high/0`), and nothing is renamed.
-pub(super) fn disambiguate(frames: &mut [ListedView]) {
+pub(super) fn disambiguate(frames: &mut [ViewEntry]) {
     let are_distinct =
         |names: &[String]| names.iter().collect::<BTreeSet<_>>().len() == names.len();
     let names: Vec<String> = frames.iter().map(|frame| frame.name.clone()).collect();
     let mut views = BTreeSet::new();
-    let mut view = |frame: &ListedView| {
+    let mut view = |frame: &ViewEntry| {
         let pose = frame.view_from_world.to_cols_array().map(f64::to_bits);
         views.insert((frame.name.clone(), pose))
     };
     if are_distinct(&names) || !frames.iter().all(&mut view) {
         return;
     }
-    for path in [|frame: &ListedView| flat(&frame.below), |frame: &ListedView| flat(&frame.listed)]
-    {
+    for path in [|frame: &ViewEntry| flat(&frame.below), |frame: &ViewEntry| flat(&frame.listed)] {
         let names: Vec<String> = frames.iter().map(path).collect();
         if are_distinct(&names) {
             frames.iter_mut().zip(names).for_each(|(frame, name)| frame.name = name);

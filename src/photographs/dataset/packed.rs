@@ -21,7 +21,7 @@ const EIGHT: f32 = 255.0;
 const SIXTEEN: f32 = 65_535.0;
 
 impl Packed {
-    pub(super) fn of(image: &Image) -> Self {
+    pub(super) fn new(image: &Image) -> Self {
         let values = match codes(image) {
             Some(EIGHT) => {
                 Values::Eight(image.data.iter().map(|x| (x * EIGHT).round() as u8).collect())
@@ -77,7 +77,7 @@ mod tests {
         let any = of(&|i| i as f32 * 1e-3 - 0.1);
         let nan = of(&|_| f32::NAN);
         for (image, bytes) in [(eight, 1), (sixteen, 2), (any, 4), (nan, 4)] {
-            let packed = Packed::of(&image);
+            let packed = Packed::new(&image);
             assert_eq!(packed.bytes(), bytes * 3 * 256);
             let back = packed.image();
             let bits =

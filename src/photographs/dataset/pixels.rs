@@ -10,15 +10,15 @@ use super::allowance::Allowance;
 use super::borders::Borders;
 use super::dark_references;
 use super::depth::depth_map;
-use super::layout::Layout;
-use super::loaded::Loaded;
+use super::layout::DatasetLayout;
+use super::loaded::LoadedView;
 use super::original::Original;
 use super::packed::Packed;
 use super::points;
 use super::prepare::{Preparation, check_size, disagreement, pixel_count};
-use super::source::{MAX_READ, Source};
+use super::source::{MAX_READ, ViewFiles};
 use super::tracked;
-use super::turns::{Header, Pixels, Turns};
+use super::turns::{CameraPixels, ImageHeader, Turns};
 use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
@@ -35,21 +35,21 @@ const MIN_SIDE: u32 = 16;
 const BYTES_PER_PIXEL: u64 = 12;
 
 /// Sees a training photograph as it is stored, with its mask, while it is decoded; from any thread.
-pub(crate) type Look<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>) + Sync);
+pub(crate) type PhotographObserver<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>) + Sync);
 
 /// The views in order of name. Files that cannot be decoded are named in `skipped`.
 pub(super) fn load(
-    mut sources: Vec<Source>,
-    layout: &Layout,
+    mut sources: Vec<ViewFiles>,
+    layout: &DatasetLayout,
     options: &LoadOptions,
-    look: Option<Look<'_>>,
+    observer: Option<PhotographObserver<'_>>,
     gains: Option<WhiteBalanceGains>,
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
     let memory = Allowance::new(MAX_READ);
-    let headers: Vec<[Option<Header>; 2]> =
+    let headers: Vec<[Option<ImageHeader>; 2]> =
         sources.par_iter_mut().map(|source| source.headers(&memory)).collect();
-    let of_photographs: Vec<Option<Header>> =
+    let of_photographs: Vec<Option<ImageHeader>> =
         headers.iter().map(|[photograph, _]| *photograph).collect();
     let points = || points::of_sources(layout, &sources);
     let pixels = tracked::pixels(&sources, &of_photographs, options.orientation, points)?;
@@ -57,7 +57,7 @@ pub(super) fn load(
         source.fit(headers, pixels)?;
         Ok(source)
     });
-    let mut groups: Vec<(Lens, Vec<Source>)> = Vec::new();
+    let mut groups: Vec<(Lens, Vec<ViewFiles>)> = Vec::new();
     let mut indices = HashMap::new();
     for source in fitted.collect::<Result<Vec<_>>>()? {
         // The Debug output distinguishes all lenses.
@@ -75,28 +75,28 @@ pub(super) fn load(
     let largest = groups.iter().map(|(lens, _)| pixel_count((lens.width, lens.height))).max();
     let at_once = Image::decoded_at_once(largest.unwrap_or_default());
     let originals = Allowance::new(bytes_for_originals(&groups, options));
-    let colours = [ColourCounts::default(), ColourCounts::of("reference image")];
+    let colours = [ColourCounts::default(), ColourCounts::new("reference image")];
     let loading = Loading {
         options,
         at_once,
-        look,
+        observer,
         gains,
         originals: &originals,
         borders: &borders,
         colours: &colours,
     };
-    let mut loaded: Vec<Loaded> = vec![];
+    let mut loaded: Vec<LoadedView> = vec![];
     while !groups.is_empty() {
         // Files that were read are dropped with their group.
         let now: Vec<_> = groups.drain(..groups.len().min(at_once)).collect();
         let now = now.into_par_iter().map(|(lens, group)| load_group(&lens, group, &loading));
         loaded.extend(now.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
-    colours.iter().for_each(ColourCounts::say);
+    colours.iter().for_each(ColourCounts::log);
     loaded.sort_by(|a, b| a.name.cmp(&b.name));
     dark_references::drop_from(&mut loaded, options);
     let mut views = Vec::with_capacity(loaded.len());
-    for Loaded { view, problems, .. } in loaded {
+    for LoadedView { view, problems, .. } in loaded {
         views.extend(view);
         skipped.extend(problems);
     }
@@ -108,7 +108,7 @@ struct Loading<'a> {
     options: &'a LoadOptions,
     /// Number of photographs that are decoded concurrently.
     at_once: usize,
-    look: Option<Look<'a>>,
+    observer: Option<PhotographObserver<'a>>,
     /// White balance of the photographs.
     gains: Option<WhiteBalanceGains>,
     /// For photographs at their own size.
@@ -121,14 +121,14 @@ struct Loading<'a> {
 
 /// Bytes that `keep` leaves for photographs at their original size, if a curve is applied at that size: it requires the
 /// statistics of all of them first.
-fn bytes_for_originals(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> u64 {
+fn bytes_for_originals(groups: &[(Lens, Vec<ViewFiles>)], options: &LoadOptions) -> u64 {
     let most = options.keep.filter(|_| options.measured == MeasuredSize::Own);
     most.unwrap_or_default().saturating_sub(kept_bytes(groups, options))
 }
 
 /// Bytes of the photographs and reference images as loaded.
-fn kept_bytes(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> u64 {
-    let bytes = |(lens, group): &(Lens, Vec<Source>)| {
+fn kept_bytes(groups: &[(Lens, Vec<ViewFiles>)], options: &LoadOptions) -> u64 {
+    let bytes = |(lens, group): &(Lens, Vec<ViewFiles>)| {
         let size = options.loaded_size(lens.width, lens.height);
         let pictures = group.iter().flat_map(|source| [&source.input, &source.reference]).flatten();
         pictures.count() as u64 * pixel_count(size) * BYTES_PER_PIXEL
@@ -137,7 +137,7 @@ fn kept_bytes(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> u64 {
 }
 
 /// The options, of which `keep` is 0 where the photographs exceed it: none is kept. Says where `max_resolution` acts.
-fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOptions {
+fn resolved(groups: &[(Lens, Vec<ViewFiles>)], options: &LoadOptions) -> LoadOptions {
     let bytes = kept_bytes(groups, options);
     let mut shrunk: Vec<&Lens> = vec![];
     for (lens, _) in groups {
@@ -168,13 +168,13 @@ fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOption
     LoadOptions { keep, ..options.clone() }
 }
 
-impl Source {
+impl ViewFiles {
     /// Finds the rotation of its images, and fits the listed lens to the photograph, or to the reference image if there
     /// is none.
-    fn fit(&mut self, headers: [Option<Header>; 2], pixels: Pixels) -> Result<()> {
+    fn fit(&mut self, headers: [Option<ImageHeader>; 2], pixels: CameraPixels) -> Result<()> {
         let lens = self.lens;
         // What has no readable header is named when it is decoded.
-        let turns = |header: Header| Turns::new(header, &lens, pixels);
+        let turns = |header: ImageHeader| Turns::new(header, &lens, pixels);
         self.turns = headers.map(|header| header.map(turns).unwrap_or_default());
         let sizes = headers
             .into_iter()
@@ -198,7 +198,11 @@ impl Source {
 }
 
 /// Loads the views of one lens.
-fn load_group(lens: &Lens, mut group: Vec<Source>, loading: &Loading<'_>) -> Result<Vec<Loaded>> {
+fn load_group(
+    lens: &Lens,
+    mut group: Vec<ViewFiles>,
+    loading: &Loading<'_>,
+) -> Result<Vec<LoadedView>> {
     let options = loading.options;
     let size = options.loaded_size(lens.width, lens.height);
     let first = group.first().map(|source| source.name.clone()).unwrap_or_default();
@@ -254,7 +258,7 @@ struct ViewLoader<'a> {
 }
 
 /// A picture of a view.
-struct Decoded {
+struct DecodedPicture {
     path: PathBuf,
     /// As it is stored.
     image: Image,
@@ -266,10 +270,19 @@ struct Decoded {
 type InMemory = (Option<Image>, Option<Original>);
 
 impl ViewLoader<'_> {
-    fn load(&self, source: Source) -> Result<Loaded> {
+    fn load(&self, source: ViewFiles) -> Result<LoadedView> {
         let Self { preparation, camera, unseen, loading } = self;
-        let Source {
-            name, split, view_from_world, input, reference, mask, depth, read, turns, ..
+        let ViewFiles {
+            name,
+            split,
+            view_from_world,
+            input,
+            reference,
+            mask,
+            depth,
+            read,
+            turns,
+            ..
         } = source;
         let (options, [read, read_reference]) = (loading.options, read);
         let mut problems = Vec::new();
@@ -283,16 +296,18 @@ impl ViewLoader<'_> {
         let picture = photograph.as_ref().or(reference.as_ref());
         let orientation = picture.map(|picture| picture.turns.viewing).unwrap_or_default();
         let stored_mask = match picture {
-            Some(Decoded { path, image, alpha, turns }) => {
+            Some(DecodedPicture { path, image, alpha, turns }) => {
                 let decoded = (image, alpha.as_ref());
                 let stored = Mask::over(path, decoded, mask.as_ref(), options.invert_masks)?;
-                let stored = loading.borders.hidden_too(stored, (image.width, image.height));
+                let stored = loading.borders.hide_borders(stored, (image.width, image.height));
                 stored.map(|stored| (stored, path.clone(), turns.loading))
             }
             None => None,
         };
-        if let (Some(look), Some(photograph), Split::Train) = (loading.look, &photograph, split) {
-            look(&name, &photograph.image, stored_mask.as_ref().map(|(stored, ..)| stored));
+        if let (Some(observer), Some(photograph), Split::Train) =
+            (loading.observer, &photograph, split)
+        {
+            observer(&name, &photograph.image, stored_mask.as_ref().map(|(stored, ..)| stored));
         }
         let mask = stored_mask
             .map(|(stored, path, orientation)| preparation.mask(&stored, &path, orientation));
@@ -320,7 +335,7 @@ impl ViewLoader<'_> {
         let view = View::new(&name, split, Camera { view_from_world, ..*camera }, image);
         let view = View { orientation, original, reference, reference_file, mask, depth, ..view };
         let view = (split == Split::Test || view.has_photograph()).then_some(view);
-        Ok(Loaded { name, view, problems, brightness, reference: reference_original })
+        Ok(LoadedView { name, view, problems, brightness, reference: reference_original })
     }
 
     /// Decodes a file; `None`, and a problem, where that is no picture.
@@ -331,7 +346,7 @@ impl ViewLoader<'_> {
         turns: Turns,
         colours: &ColourCounts,
         problems: &mut Vec<String>,
-    ) -> Result<Option<Decoded>> {
+    ) -> Result<Option<DecodedPicture>> {
         let lens = self.preparation.lens;
         let Some(path) = path else { return Ok(None) };
         let file =
@@ -340,7 +355,7 @@ impl ViewLoader<'_> {
             check_size(&path, file, turns, lens)?;
         }
         match file.and_then(|file| file.decode_counted(colours)) {
-            Ok((image, alpha)) => Ok(Some(Decoded { path, image, alpha, turns })),
+            Ok((image, alpha)) => Ok(Some(DecodedPicture { path, image, alpha, turns })),
             Err(error) => {
                 problems.push(error.to_string());
                 Ok(None)
@@ -351,13 +366,13 @@ impl ViewLoader<'_> {
     /// The photograph of a view; one for training is measured as the options say.
     fn photograph(
         &self,
-        decoded: Decoded,
+        decoded: DecodedPicture,
         mask: Option<&Mask>,
         is_training: bool,
     ) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
-        let Decoded { path, image, turns, .. } = decoded;
+        let DecodedPicture { path, image, turns, .. } = decoded;
         let whole = preparation.whole(image.turned(turns.loading), &path)?;
         let is_shrunk = preparation.size != (whole.width, whole.height);
         let is_kept = options.keep != Some(0);
@@ -367,14 +382,14 @@ impl ViewLoader<'_> {
         let mut original = Original::new(path, *preparation.lens, options.undistort, turns);
         original.gains = loading.gains;
         let measured = |image: &Image| match mask {
-            Some(mask) => MeasuredPhotograph::of(&mask.counted(image)),
-            None => MeasuredPhotograph::of(&image.data),
+            Some(mask) => MeasuredPhotograph::measure(&mask.counted(image)),
+            None => MeasuredPhotograph::measure(&image.data),
         };
         let at = if is_training { options.measured } else { MeasuredSize::None };
         if at == MeasuredSize::Own {
             original.measured = Some((at, measured(&whole)));
             if is_shrunk {
-                let packed = Packed::of(&whole);
+                let packed = Packed::new(&whole);
                 if loading.originals.take(packed.bytes()) {
                     original.store(packed);
                 }
@@ -393,9 +408,9 @@ impl ViewLoader<'_> {
         Ok((None, Some(original)))
     }
 
-    fn reference_image(&self, decoded: Decoded) -> Result<InMemory> {
+    fn reference_image(&self, decoded: DecodedPicture) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
-        let Decoded { path, image, turns, .. } = decoded;
+        let DecodedPicture { path, image, turns, .. } = decoded;
         if loading.options.keep == Some(0) {
             let undistort = loading.options.undistort;
             let file = Original::new(path, *preparation.lens, undistort, turns);

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DVec3};
 
 use crate::base::input;
-use crate::base::ply::{Encoding, Header, Kind, Property};
+use crate::base::ply::{PlyEncoding, PlyHeader, PlyProperty, PlyScalar};
 use crate::{Error, Result};
 
 /// A file of points.
@@ -21,7 +21,7 @@ pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
     let bytes = input::bytes(path)?;
     let no_points =
         |problem: &str| Error::input(path, format!("{problem}; its points are not read"));
-    let header = Header::parse(&bytes).map_err(|problem| no_points(&problem))?;
+    let header = PlyHeader::parse(&bytes).map_err(|problem| no_points(&problem))?;
     if header.properties.iter().any(|property| property.name.starts_with("f_dc_")) {
         return Err(no_points("is a model of Gaussians, not of points"));
     }
@@ -29,7 +29,7 @@ pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
     let axes = ["x", "y", "z"].map(|axis| header.property(axis));
     let [Some(x), Some(y), Some(z)] = axes else { return Err(no_points("has no x, y and z")) };
     let points = match header.encoding {
-        Encoding::Text => {
+        PlyEncoding::Text => {
             of_text(&String::from_utf8_lossy(body), &header, [x, y, z].map(|(field, _)| field))
         }
         _ => of_bytes(body, &header, [x, y, z].map(|(_, property)| property)),
@@ -39,13 +39,13 @@ pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
     Ok(points)
 }
 
-fn of_bytes(body: &[u8], header: &Header, axes: [&Property; 3]) -> Option<Vec<DVec3>> {
+fn of_bytes(body: &[u8], header: &PlyHeader, axes: [&PlyProperty; 3]) -> Option<Vec<DVec3>> {
     let body = body.get(..header.count.checked_mul(header.stride)?)?;
-    let number = |vertex: &[u8], property: &Property| {
+    let number = |vertex: &[u8], property: &PlyProperty| {
         let mut bytes = [0; 8];
         let size = property.kind.size();
         bytes[..size].copy_from_slice(&vertex[property.at..property.at + size]);
-        if header.encoding == Encoding::Big {
+        if header.encoding == PlyEncoding::Big {
             bytes[..size].reverse();
         }
         value(property.kind, bytes)
@@ -55,13 +55,13 @@ fn of_bytes(body: &[u8], header: &Header, axes: [&Property; 3]) -> Option<Vec<DV
 }
 
 /// The value of a number's bytes, the least significant first.
-fn value(kind: Kind, bytes: [u8; 8]) -> f64 {
+fn value(kind: PlyScalar, bytes: [u8; 8]) -> f64 {
     let unsigned = u64::from_le_bytes(bytes);
     match kind {
-        Kind::Float(4) => f64::from(f32::from_bits(unsigned as u32)),
-        Kind::Float(_) => f64::from_bits(unsigned),
-        Kind::Unsigned(_) => unsigned as f64,
-        Kind::Signed(size) => {
+        PlyScalar::Float(4) => f64::from(f32::from_bits(unsigned as u32)),
+        PlyScalar::Float(_) => f64::from_bits(unsigned),
+        PlyScalar::Unsigned(_) => unsigned as f64,
+        PlyScalar::Signed(size) => {
             let unused = 64 - 8 * size as u32;
             ((unsigned << unused) as i64 >> unused) as f64
         }
@@ -69,7 +69,7 @@ fn value(kind: Kind, bytes: [u8; 8]) -> f64 {
 }
 
 /// Of the places of x, y and z in a line.
-fn of_text(body: &str, header: &Header, axes: [usize; 3]) -> Option<Vec<DVec3>> {
+fn of_text(body: &str, header: &PlyHeader, axes: [usize; 3]) -> Option<Vec<DVec3>> {
     let lines = body.lines().filter(|line| !line.trim().is_empty()).take(header.count);
     let point = |line: &str| {
         let fields: Vec<&str> = line.split_whitespace().collect();
@@ -117,7 +117,7 @@ mod tests {
         assert_eq!(read(&head("binary_little_endian", "float"), &little).unwrap(), expected);
         let big = body(&|value| value.to_be_bytes().to_vec());
         assert_eq!(read(&head("binary_big_endian", "double"), &big).unwrap(), expected);
-        let whole = value(Kind::Signed(2), [0xfe, 0xff, 0, 0, 0, 0, 0, 0]);
+        let whole = value(PlyScalar::Signed(2), [0xfe, 0xff, 0, 0, 0, 0, 0, 0]);
         assert_eq!(whole, -2.0);
     }
 

@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DVec3};
 
-use super::layout::{CAMERAS, Layout};
+use super::layout::{CAMERAS, DatasetLayout};
 use super::ply::Cloud;
 use super::similarity::Similarity;
-use super::source::Source;
+use super::source::ViewFiles;
 use super::{Point, View, colmap, names, ply};
 use crate::Result;
 use crate::base::tree;
@@ -19,7 +19,11 @@ const MAX_WORLD_RESIDUAL: f64 = 0.01;
 
 /// The points of the dataset, in the views' world: those of its COLMAP model, which know the photographs that see them;
 /// where it has none, those of a PLY file that the listing names or that lies beside it.
-pub(super) fn points(layout: &Layout, views: &[View], listed: &[Cloud]) -> Result<Vec<Point>> {
+pub(super) fn points(
+    layout: &DatasetLayout,
+    views: &[View],
+    listed: &[Cloud],
+) -> Result<Vec<Point>> {
     let places: Vec<Place<'_>> = views.iter().map(Place::of_view).collect();
     let of_model = of_model(layout, &places)?;
     if !of_model.is_empty() {
@@ -33,7 +37,7 @@ pub(super) fn points(layout: &Layout, views: &[View], listed: &[Cloud]) -> Resul
     let models = layout.models(&CAMERAS);
     for folder in &models {
         let Some(points) = beside(folder).find_map(|cloud| read(&cloud.file)) else { continue };
-        if let Some(to_views) = Shared::of(folder, &places)?.to_views(folder) {
+        if let Some(to_views) = SharedImages::read(folder, &places)?.to_views(folder) {
             let point = |position| Point { position: to_views(position), views: vec![] };
             return Ok(points.into_iter().map(point).collect());
         }
@@ -51,7 +55,7 @@ fn beside(folder: &Path) -> impl Iterator<Item = Cloud> + use<> {
 }
 
 /// Names the files of points that are not read where the dataset has none.
-fn warn_of_unread(layout: &Layout, models: &[PathBuf]) {
+fn warn_of_unread(layout: &DatasetLayout, models: &[PathBuf]) {
     const ENDINGS: [&str; 6] = ["ply", "pcd", "las", "laz", "e57", "pts"];
     let folders = [&layout.root].into_iter().chain(models);
     let mut files: Vec<PathBuf> =
@@ -110,7 +114,7 @@ fn placed(cloud: &Cloud, points: Vec<DVec3>, views: &[View]) -> Vec<Point> {
 }
 
 /// The points of the dataset's COLMAP model, with indices into `sources`.
-pub(super) fn of_sources(layout: &Layout, sources: &[Source]) -> Result<Vec<Point>> {
+pub(super) fn of_sources(layout: &DatasetLayout, sources: &[ViewFiles]) -> Result<Vec<Point>> {
     of_model(layout, &sources.iter().map(Place::of_source).collect::<Vec<_>>())
 }
 
@@ -125,19 +129,19 @@ impl Place<'_> {
         Place { name: &view.name, center: view.camera.center() }
     }
 
-    fn of_source(source: &Source) -> Place<'_> {
+    fn of_source(source: &ViewFiles) -> Place<'_> {
         Place { name: &source.name, center: source.view_from_world.inverse().translation }
     }
 }
 
 /// The photographs that a model and the views share.
-struct Shared {
+struct SharedImages {
     /// Image id, view, and the camera's position in either world.
     images: Vec<(u32, u32, [DVec3; 2])>,
 }
 
-impl Shared {
-    fn of(folder: &Path, views: &[Place<'_>]) -> Result<Self> {
+impl SharedImages {
+    fn read(folder: &Path, views: &[Place<'_>]) -> Result<Self> {
         let view_named = view_named(views);
         let images = colmap::read_images(folder)?;
         let shared = images.iter().filter_map(|image| {
@@ -165,14 +169,14 @@ fn view_named(views: &[Place<'_>]) -> impl Fn(&str) -> Option<u32> {
 }
 
 /// The points of the dataset's COLMAP model.
-fn of_model(layout: &Layout, views: &[Place<'_>]) -> Result<Vec<Point>> {
+fn of_model(layout: &DatasetLayout, views: &[Place<'_>]) -> Result<Vec<Point>> {
     let models = layout.models(&["images", "points3D"]);
     let view_named = view_named(views);
     let Some((folder, _)) = colmap::largest(&models, |name| view_named(name).is_some())? else {
         return Ok(Vec::new());
     };
     let points = colmap::read_points(folder)?;
-    let shared = Shared::of(folder, views)?;
+    let shared = SharedImages::read(folder, views)?;
     let Some(to_views) = shared.to_views(folder) else {
         return Ok(Vec::new());
     };

@@ -153,7 +153,7 @@ pub(super) fn pixel_count((width, height): (u32, u32)) -> u64 {
 /// The error for an image whose aspect ratio, upright or not, is not its camera's.
 pub(super) fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {
     let (w, h) = (lens.width, lens.height);
-    let (seen_width, seen_height) = Orientation::of(path).size((width, height));
+    let (seen_width, seen_height) = Orientation::from_file(path).size((width, height));
     let seen = if seen_width == width {
         String::new()
     } else {

@@ -7,14 +7,14 @@ use glam::DAffine3;
 
 use super::Split;
 use super::allowance::Allowance;
-use super::turns::{Header, Turns};
+use super::turns::{ImageHeader, Turns};
 use crate::base::tree;
 use crate::camera::Lens;
 use crate::photographs::image::{Image, MaskFile, Orientation, PictureFile};
 
 /// The files and the camera of a view.
 #[derive(Clone, Debug)]
-pub(super) struct Source {
+pub(super) struct ViewFiles {
     pub(super) name: String,
     pub(super) split: Split,
     /// As listed; `fit` scales it to the photograph's size.
@@ -30,20 +30,21 @@ pub(super) struct Source {
     pub(super) turns: [Turns; 2],
 }
 
-impl Source {
+impl ViewFiles {
     /// Reads the files of the photograph and of the reference image; returns the header of each, if readable, and keeps
     /// the files while `memory` allows.
-    pub(super) fn headers(&mut self, memory: &Allowance) -> [Option<Header>; 2] {
+    pub(super) fn headers(&mut self, memory: &Allowance) -> [Option<ImageHeader>; 2] {
         let paths = [self.input.as_deref(), self.reference.as_deref()];
         let mut headers = [None; 2];
         for ((path, read), header) in paths.into_iter().zip(&mut self.read).zip(&mut headers) {
             let Some(path) = path else { continue };
             let bytes = tree::metadata(path).map_or(u64::MAX, |(length, _)| length);
             if !memory.take(bytes) {
-                let of_size = |size| Header { size, orientation: Orientation::of(path) };
+                let of_size =
+                    |size| ImageHeader { size, orientation: Orientation::from_file(path) };
                 *header = Image::size_of(path).ok().map(of_size);
             } else if let Ok(file) = PictureFile::open(path) {
-                let of_size = |size| Header { size, orientation: file.orientation() };
+                let of_size = |size| ImageHeader { size, orientation: file.orientation() };
                 *header = file.size().ok().map(of_size);
                 *read = Some(Arc::new(file));
             }

@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::listing::ListedView;
+use super::listing::ViewEntry;
 use super::{LoadOptions, Split, names};
 use crate::Result;
 use crate::base::{input, tree};
-use crate::photographs::image::files::Files;
+use crate::photographs::image::files::PhotographFiles;
 
 /// Every eighth of the name-sorted views is held out by default.
 pub(super) const TEST_EVERY: usize = 8;
@@ -22,16 +22,16 @@ pub(super) fn test_list(root: &Path) -> Option<PathBuf> {
 /// eighth. With `test_every`, every Nth instead of any other rule; 0: none.
 pub(super) fn split(
     root: &Path,
-    frames: &mut [ListedView],
+    frames: &mut [ViewEntry],
     test_every: Option<usize>,
-    files: &Files,
+    files: &PhotographFiles,
 ) -> Result<()> {
     if let Some(every) = test_every {
         split_anew(root, frames, every, files);
         return Ok(());
     }
     let list = test_list(root);
-    let mut undecided: Vec<&mut ListedView> =
+    let mut undecided: Vec<&mut ViewEntry> =
         frames.iter_mut().filter(|frame| frame.split.is_none()).collect();
     let Some(path) = list.filter(|_| !undecided.is_empty()) else {
         for (index, frame) in undecided.into_iter().enumerate() {
@@ -40,11 +40,12 @@ pub(super) fn split(
         return Ok(());
     };
     let text = input::text(&path)?;
-    let known: BTreeSet<String> = undecided.iter().map(|frame| frame.name.clone()).collect();
+    let undecided_names: BTreeSet<String> =
+        undecided.iter().map(|frame| frame.name.clone()).collect();
     let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
     let (mut held_out, mut unknown) = (BTreeSet::new(), BTreeSet::new());
     for line in lines {
-        match names::possible(line).into_iter().find(|name| known.contains(name)) {
+        match names::possible(line).into_iter().find(|name| undecided_names.contains(name)) {
             Some(name) => held_out.insert(name),
             None => unknown.insert(line.to_owned()),
         };
@@ -80,7 +81,7 @@ pub(super) fn log_split(root: &Path, has_split: bool, options: &LoadOptions) {
 
 /// Holds out every Nth view by name instead of the dataset's own split. A listed test view without a dark photograph
 /// cannot be trained on: it stays a pose.
-fn split_anew(root: &Path, frames: &mut [ListedView], every: usize, files: &Files) {
+fn split_anew(root: &Path, frames: &mut [ViewEntry], every: usize, files: &PhotographFiles) {
     let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
     let training_folders: BTreeSet<String> =
         training.map(|frame| frame.folder().to_owned()).collect();

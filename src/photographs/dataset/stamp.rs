@@ -2,13 +2,13 @@
 
 use std::path::Path;
 
-use super::layout::Layout;
+use super::layout::DatasetLayout;
 use super::listing::{Listing, select};
 use super::{Dataset, LoadOptions, sources};
 use crate::Result;
 use crate::base::hash::{self, Hasher};
 use crate::base::tree;
-use crate::photographs::image::files::Files;
+use crate::photographs::image::files::PhotographFiles;
 
 impl Dataset {
     /// A checksum of the listing below `root`: views with their cameras and splits, and path, length and time of change
@@ -16,8 +16,8 @@ impl Dataset {
     /// photographs were rewritten, has another stamp even with the same pixels; one that was moved has the same.
     pub(crate) fn stamp(root: &Path, options: &LoadOptions) -> Result<String> {
         options.check()?;
-        let files = Files::default();
-        let layout = Layout::of(root)?;
+        let files = PhotographFiles::default();
+        let layout = DatasetLayout::detect(root)?;
         let root = layout.root.as_path();
         let Listing { frames, mut skipped, .. } = select(&layout, options, &files)?;
         let mut hasher = Hasher::default();

@@ -40,7 +40,7 @@ trait Scene: Sync {
     fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3>;
 
     /// The position of camera `view` of `views`, and the unit vector from what it looks at towards it.
-    fn place(&self, view: usize, views: usize) -> [DVec3; 2];
+    fn camera_position(&self, view: usize, views: usize) -> [DVec3; 2];
 }
 
 /// How much darker the dark photographs are, in linear light.
@@ -218,11 +218,11 @@ pub fn write_captured(
         None => (Box::new(Room::new(options.seed, options.lamp.is_some())), 2400),
         Some(plots) => (Box::new(Street::new(plots, options.seed)), 400 * u64::from(plots)),
     };
-    let camera = |view| camera(scene.place(view, options.views), options);
+    let camera = |view| camera(scene.camera_position(view, options.views), options);
     let cameras: Vec<Camera> = (0..options.views).map(camera).collect();
     for (view, camera) in cameras.iter().enumerate() {
         let name = file_name(view, cameras.len());
-        let lamp = options.lamp.map(|degrees| CameraLamp::of(camera, degrees));
+        let lamp = options.lamp.map(|degrees| CameraLamp::new(camera, degrees));
         let [even, dim] = render(&*scene, camera, lamp.as_ref());
         bright_photograph(&even, camera).save_png8(high.join(&name))?;
         if let Some(lit) = lit.as_ref().filter(|_| is_test(view)) {

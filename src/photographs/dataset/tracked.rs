@@ -4,8 +4,8 @@
 use rayon::prelude::*;
 
 use super::Point;
-use super::source::Source;
-use super::turns::{Header, PixelOrientation, Pixels};
+use super::source::ViewFiles;
+use super::turns::{CameraPixels, ImageHeader, PixelOrientation};
 use crate::Result;
 use crate::camera::Lens;
 use crate::photographs::image::{Image, Orientation};
@@ -23,27 +23,27 @@ const HALF_SIDE: f64 = 1.0 / 250.0;
 /// The pixels that the cameras are of where sizes do not tell. One program found them all, so that one answer holds for
 /// all photographs. `points` gives the dataset's points, with indices into `sources`.
 pub(super) fn pixels(
-    sources: &[Source],
-    headers: &[Option<Header>],
+    sources: &[ViewFiles],
+    headers: &[Option<ImageHeader>],
     choice: PixelOrientation,
     points: impl FnOnce() -> Result<Vec<Point>>,
-) -> Result<Pixels> {
-    let turned: Vec<(usize, Header)> = headers
+) -> Result<CameraPixels> {
+    let turned: Vec<(usize, ImageHeader)> = headers
         .iter()
         .enumerate()
         .filter_map(|(index, header)| Some((index, (*header)?)))
         .filter(|(_, header)| header.orientation != Orientation::UPRIGHT)
         .collect();
-    let by_size = |(index, header): &(usize, Header)| header.by_size(&sources[*index].lens);
+    let by_size = |(index, header): &(usize, ImageHeader)| header.by_size(&sources[*index].lens);
     let (told, open): (Vec<_>, Vec<_>) =
         turned.into_iter().partition(|image| by_size(image).is_some());
-    let Some(first) = open.first() else { return Ok(Pixels::Stored) };
+    let Some(first) = open.first() else { return Ok(CameraPixels::Stored) };
     match choice {
-        PixelOrientation::Stored => return Ok(Pixels::Stored),
-        PixelOrientation::Exif => return Ok(Pixels::Exif),
+        PixelOrientation::Stored => return Ok(CameraPixels::Stored),
+        PixelOrientation::Exif => return Ok(CameraPixels::Exif),
         PixelOrientation::Auto => {}
     }
-    let mut told: Vec<Pixels> = told.iter().filter_map(by_size).collect();
+    let mut told: Vec<CameraPixels> = told.iter().filter_map(by_size).collect();
     told.dedup();
     if let [only] = told[..] {
         return Ok(only);
@@ -55,8 +55,10 @@ pub(super) fn pixels(
          cameras are of"
     );
     match found {
-        Some(Pixels::Stored) => tracing::info!("{subject}: those stored, by the points they share"),
-        Some(Pixels::Exif) => {
+        Some(CameraPixels::Stored) => {
+            tracing::info!("{subject}: those stored, by the points they share");
+        }
+        Some(CameraPixels::Exif) => {
             tracing::info!("{subject}: those that Exif shows, by the points they share");
         }
         None => tracing::warn!(
@@ -64,17 +66,17 @@ pub(super) fn pixels(
              these"
         ),
     }
-    Ok(found.unwrap_or(Pixels::Stored))
+    Ok(found.unwrap_or(CameraPixels::Stored))
 }
 
 /// The pixels with which the photographs agree on their points; `None` where that is not clear. `open` are those, with
 /// indices into `sources`, for which the answer is wanted.
 fn by_points(
-    sources: &[Source],
-    headers: &[Option<Header>],
-    open: &[(usize, Header)],
+    sources: &[ViewFiles],
+    headers: &[Option<ImageHeader>],
+    open: &[(usize, ImageHeader)],
     points: &[Point],
-) -> Option<Pixels> {
+) -> Option<CameraPixels> {
     let chosen = neighbours(sources.len(), open, points)?;
     let sampled = chosen.par_iter().map(|&view| {
         let image = sources[view].picture()?;
@@ -93,8 +95,8 @@ fn by_points(
     tracing::debug!("agreement on points: {stored:.3} as stored, {exif:.3} as Exif shows");
     match exif - stored {
         _ if pairs < LEAST_PAIRS => None,
-        difference if difference > clear => Some(Pixels::Exif),
-        difference if difference < -clear => Some(Pixels::Stored),
+        difference if difference > clear => Some(CameraPixels::Exif),
+        difference if difference < -clear => Some(CameraPixels::Stored),
         _ => None,
     }
 }
@@ -104,7 +106,7 @@ fn sees(point: &Point, view: usize) -> bool {
 }
 
 /// The photograph that sees most points of those in question, and those that share most with it.
-fn neighbours(count: usize, open: &[(usize, Header)], points: &[Point]) -> Option<Vec<usize>> {
+fn neighbours(count: usize, open: &[(usize, ImageHeader)], points: &[Point]) -> Option<Vec<usize>> {
     let mut seen = vec![0; count];
     points.iter().flat_map(|point| &point.views).for_each(|&view| seen[view as usize] += 1);
     let first = open.iter().map(|image| image.0).max_by_key(|&view| seen[view])?;
@@ -119,12 +121,12 @@ fn neighbours(count: usize, open: &[(usize, Header)], points: &[Point]) -> Optio
 }
 
 /// The brightness of points in a picture, by their index; without those that lie outside.
-fn samples(image: &Image, source: &Source, points: &[(usize, &Point)]) -> Vec<(usize, f64)> {
+fn samples(image: &Image, source: &ViewFiles, points: &[(usize, &Point)]) -> Vec<(usize, f64)> {
     let brightness = |(index, point): &(usize, &Point)| {
-        let place = place(source, point)?;
+        let position = position_in_image(source, point)?;
         let (width, height) = (f64::from(image.width), f64::from(image.height));
         let half = (HALF_SIDE * width.max(height)).round() as i64;
-        let (x, y) = ((place[0] * width) as i64, (place[1] * height) as i64);
+        let (x, y) = ((position[0] * width) as i64, (position[1] * height) as i64);
         let (mut sum, mut count) = (0.0, 0.0);
         for row in (y - half).max(0)..=(y + half).min(i64::from(image.height) - 1) {
             for column in (x - half).max(0)..=(x + half).min(i64::from(image.width) - 1) {
@@ -138,14 +140,14 @@ fn samples(image: &Image, source: &Source, points: &[(usize, &Point)]) -> Vec<(u
 }
 
 /// Where a camera has a point, as parts of width and height.
-fn place(source: &Source, point: &Point) -> Option<[f64; 2]> {
+fn position_in_image(source: &ViewFiles, point: &Point) -> Option<[f64; 2]> {
     let Lens { width, height, focal, principal_point, distortion } = source.lens;
     let in_view = source.view_from_world.transform_point3(point.position);
     let at = in_view.truncate() / in_view.z;
     let pixel = focal * distortion.distort(at) + principal_point;
-    let place = [pixel.x / f64::from(width), pixel.y / f64::from(height)];
-    let is_seen = in_view.z > 0.0 && place.iter().all(|part| (0.0..1.0).contains(part));
-    is_seen.then_some(place)
+    let position = [pixel.x / f64::from(width), pixel.y / f64::from(height)];
+    let is_seen = in_view.z > 0.0 && position.iter().all(|part| (0.0..1.0).contains(part));
+    is_seen.then_some(position)
 }
 
 /// The mean correlation of the values of a point in pairs of photographs, normalised by the mean and contrast of each

@@ -16,23 +16,23 @@ use serde_json::{Map, Value};
 use self::intrinsics::Intrinsics;
 use self::keys::Unsupported;
 use self::matrix::Rows;
-use super::listing::{ListedView, Listing};
+use super::listing::{Listing, ViewEntry};
 use super::locate::{self, Wanted};
 use super::ply::Cloud;
 use super::{Split, names};
 use crate::base::{input, tree};
 use crate::photographs::image::MaskFile;
-use crate::photographs::image::files::{Files, stem};
+use crate::photographs::image::files::{PhotographFiles, stem};
 use crate::{Error, Result};
 
 #[derive(Deserialize)]
 struct Transforms {
     #[serde(flatten)]
     shared: Intrinsics,
-    frames: Vec<ListedFrame>,
+    frames: Vec<FrameEntry>,
     /// Held-out frames in the same format (`ScanNet++`).
     #[serde(default)]
-    test_frames: Vec<ListedFrame>,
+    test_frames: Vec<FrameEntry>,
     ply_file_path: Option<String>,
     /// 3x4 rows: from the world of the original data to that of the frames (nerfstudio).
     applied_transform: Option<Rows>,
@@ -51,7 +51,7 @@ struct StatedSplits {
 }
 
 #[derive(Deserialize)]
-struct ListedFrame {
+struct FrameEntry {
     file_path: String,
     #[serde(deserialize_with = "matrix::rows")]
     transform_matrix: Rows,
@@ -89,7 +89,7 @@ pub(super) fn read(
     root: &Path,
     images: Option<&Path>,
     listings: &[(PathBuf, Option<Split>)],
-    files: &Files,
+    files: &PhotographFiles,
     listing: &mut Listing,
 ) -> Result<()> {
     let mut frames = vec![];
@@ -121,7 +121,7 @@ pub(super) fn read(
             .lens(size)
             .map_err(|problem| Error::input(*path, format!("{}: {problem}", found.listed)))?;
         let mask = listed.mask_path.map(|path| MaskFile::shown(listed_path(&path).into()));
-        listing.frames.push(ListedView {
+        listing.frames.push(ViewEntry {
             name: names::normalized(stem(&found.listed)),
             listed: found.listed,
             below: found.below,
@@ -159,8 +159,8 @@ fn listed_path(path: &str) -> String {
 }
 
 /// A frame with its pose.
-struct TrainingFrame {
-    listed: ListedFrame,
+struct PosedFrame {
+    listed: FrameEntry,
     split: Option<Split>,
     view_from_world: DAffine3,
 }
@@ -171,13 +171,13 @@ fn usable_frames(
     transforms: &mut Transforms,
     split: Option<Split>,
     listing: &mut Listing,
-) -> Vec<TrainingFrame> {
+) -> Vec<PosedFrame> {
     let mut unsupported = Unsupported::default();
     unsupported.add(&transforms.others);
     let held_out = std::mem::take(&mut transforms.test_frames);
     let frames = std::mem::take(&mut transforms.frames).into_iter();
     let split_of_training = if held_out.is_empty() { split } else { Some(Split::Train) };
-    let all: Vec<(ListedFrame, Option<Split>)> = frames
+    let all: Vec<(FrameEntry, Option<Split>)> = frames
         .map(|frame| (frame, split_of_training))
         .chain(held_out.into_iter().map(|frame| (frame, Some(Split::Test))))
         .collect();
@@ -193,7 +193,7 @@ fn usable_frames(
             continue;
         }
         unsupported.add(&listed.others);
-        let Some(split) = transforms.splits.of(&name, listed.split.as_deref(), split) else {
+        let Some(split) = transforms.splits.stated(&name, listed.split.as_deref(), split) else {
             unassigned += 1;
             continue;
         };
@@ -204,16 +204,16 @@ fn usable_frames(
             Ok(pose) => {
                 mended.add(&pose);
                 let view_from_world = pose.view_from_world;
-                frames.push(TrainingFrame { listed, split, view_from_world });
+                frames.push(PosedFrame { listed, split, view_from_world });
             }
         }
     }
     let shown = path.display();
-    let mut say = |line: Option<String>| listing.remarks.extend(line);
-    say(unsupported.remark(path));
-    say(mended.remark(path));
-    say((bad > 0).then(|| format!("{shown}: {bad} frames are marked bad and left out")));
-    say((unassigned > 0).then(|| {
+    let mut add_remark = |line: Option<String>| listing.remarks.extend(line);
+    add_remark(unsupported.remark(path));
+    add_remark(mended.remark(path));
+    add_remark((bad > 0).then(|| format!("{shown}: {bad} frames are marked bad and left out")));
+    add_remark((unassigned > 0).then(|| {
         format!("{shown}: {unassigned} frames are in none of its lists of file names by split, and left out")
     }));
     frames
@@ -262,7 +262,12 @@ impl Mended {
 impl StatedSplits {
     /// The split of a frame by its own key, else by the lists, else `default`; `None` if there are lists, but the frame
     /// is in none. As with files, a validation list is used only if there is no test list.
-    fn of(&self, name: &str, key: Option<&str>, default: Option<Split>) -> Option<Option<Split>> {
+    fn stated(
+        &self,
+        name: &str,
+        key: Option<&str>,
+        default: Option<Split>,
+    ) -> Option<Option<Split>> {
         match key {
             Some("train") => return Some(Some(Split::Train)),
             Some("test" | "val" | "eval") => return Some(Some(Split::Test)),

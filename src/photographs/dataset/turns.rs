@@ -44,28 +44,28 @@ impl FromStr for PixelOrientation {
 
 /// The pixels that the cameras of a dataset are of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Pixels {
+pub(super) enum CameraPixels {
     Stored,
     Exif,
 }
 
 /// What the header of a picture says.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Header {
+pub(super) struct ImageHeader {
     /// Width and height as it is stored.
     pub(super) size: (u32, u32),
     /// How that is turned for people, by its Exif.
     pub(super) orientation: Orientation,
 }
 
-impl Header {
+impl ImageHeader {
     /// The pixels that a camera is of, by its size; `None` if both have this size.
-    pub(super) fn by_size(self, lens: &Lens) -> Option<Pixels> {
+    pub(super) fn by_size(self, lens: &Lens) -> Option<CameraPixels> {
         let fits = |(width, height): (u32, u32)| lens.fitted(width, height).is_some();
         match (fits(self.size), fits(self.orientation.size(self.size))) {
             (true, true) => None,
-            (false, true) => Some(Pixels::Exif),
-            (_, false) => Some(Pixels::Stored),
+            (false, true) => Some(CameraPixels::Exif),
+            (_, false) => Some(CameraPixels::Stored),
         }
     }
 }
@@ -81,11 +81,11 @@ pub(super) struct Turns {
 
 impl Turns {
     /// Of a picture whose camera is of these pixels unless their sizes say otherwise.
-    pub(super) fn new(header: Header, lens: &Lens, pixels: Pixels) -> Self {
+    pub(super) fn new(header: ImageHeader, lens: &Lens, pixels: CameraPixels) -> Self {
         let orientation = header.orientation;
         match header.by_size(lens).unwrap_or(pixels) {
-            Pixels::Exif => Self { loading: orientation, viewing: Orientation::UPRIGHT },
-            Pixels::Stored => Self { loading: Orientation::UPRIGHT, viewing: orientation },
+            CameraPixels::Exif => Self { loading: orientation, viewing: Orientation::UPRIGHT },
+            CameraPixels::Stored => Self { loading: Orientation::UPRIGHT, viewing: orientation },
         }
     }
 }

@@ -3,13 +3,13 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::listing::ListedView;
+use super::listing::ViewEntry;
 use super::masks;
 use crate::base::tree;
 use crate::photographs::image::files::{photographs_in, unread_in};
 
 /// A line if most photographs have no pose, and one for each folder of images that are not read.
-pub(super) fn remarks(root: &Path, frames: &[ListedView]) -> Vec<String> {
+pub(super) fn remarks(root: &Path, frames: &[ViewEntry]) -> Vec<String> {
     let used: BTreeSet<&Path> = frames.iter().filter_map(|frame| frame.file.as_deref()).collect();
     let images = root.join("images");
     let all_below = used.iter().any(|file| file.starts_with(&images));

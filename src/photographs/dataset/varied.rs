@@ -60,7 +60,7 @@ impl Variation {
     }
 
     /// The numbers of the photograph at this place in the order of names.
-    pub fn of(&self, index: usize) -> Varied {
+    pub fn of_photograph(&self, index: usize) -> Varied {
         let stream = Stream::new(self.seed, 0);
         let draw = |which| stream.uniform(2 * index as u64 + which);
         let [low, high] = self.gamma.map(f64::ln);
@@ -103,8 +103,8 @@ pub fn write(dir: &Path, dataset: &Dataset, variation: &Variation) -> Result<usi
     let mut luminances = vec![];
     for (index, view) in views.iter().enumerate() {
         let Some(image) = view.loaded()? else { continue };
-        luminances.push(LuminanceHistogram::of(&view.counted(&image)));
-        let (name, varied) = (file_name(view), variation.of(index));
+        luminances.push(LuminanceHistogram::new(&view.counted(&image)));
+        let (name, varied) = (file_name(view), variation.of_photograph(index));
         image.save_png8(dir.join(CLEAN).join(&name))?;
         varied.applied(&image).save_png8(dir.join(VARIED).join(&name))?;
         let _ = writeln!(table, "{},{:.6},{:.6}", view.name, varied.stops, varied.gamma);
@@ -113,7 +113,7 @@ pub fn write(dir: &Path, dataset: &Dataset, variation: &Variation) -> Result<usi
         }
     }
     if let Some(exposure) =
-        Exposure::of(&luminances, None).filter(|exposure| exposure.weight() > 0.0)
+        Exposure::measure(&luminances, None).filter(|exposure| exposure.weight() > 0.0)
     {
         tracing::warn!(
             "{}: the {} photographs are dark (mean luminance {:.3}): varied exposures of dark photographs have no \

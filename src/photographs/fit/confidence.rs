@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, SymmetricEigen};
 
-use super::model::Model;
+use super::model::FitModel;
 use super::solve::{Group, Solution};
 use super::{Estimate, Residuals};
 
@@ -18,8 +18,8 @@ pub(super) struct Confidence {
     pub(super) effective_values: f64,
 }
 
-pub(super) fn of(
-    model: &Model,
+pub(super) fn estimate(
+    model: &FitModel,
     groups: &[Group],
     solution: &Solution,
     residuals: &Residuals,

@@ -14,12 +14,12 @@ const LARGEST_KEY: usize = (65504.0_f32.to_bits() >> KEY_SHIFT) as usize;
 
 /// Pixels of one reference value, within a column.
 #[derive(Clone, Copy, Debug)]
-pub struct Cell {
+pub struct HistogramCell {
     level: u8,
     count: f64,
 }
 
-impl Cell {
+impl HistogramCell {
     /// The reference value, in [0, 1].
     pub fn y(self) -> f64 {
         f64::from(self.level) / (LEVELS - 1) as f64
@@ -33,7 +33,7 @@ impl Cell {
 
 /// Pixels with the same dark value.
 #[derive(Clone, Debug, Default)]
-pub struct Column {
+pub struct HistogramColumn {
     /// The mean of their dark values.
     pub x: f64,
     /// Their number.
@@ -43,14 +43,14 @@ pub struct Column {
     /// The sum of the squares of their reference values.
     pub sum_y2: f64,
     /// Their reference values to 8 bits, ascending.
-    pub cells: Vec<Cell>,
+    pub cells: Vec<HistogramCell>,
 }
 
 /// Columns in the order of their dark values; none is empty.
 #[derive(Clone, Debug, Default)]
 pub struct Histogram {
     /// The columns.
-    pub columns: Vec<Column>,
+    pub columns: Vec<HistogramColumn>,
 }
 
 /// A column under construction.
@@ -63,19 +63,19 @@ struct OpenColumn {
 impl OpenColumn {
     const EMPTY: Self = Self { sums: [0.0; 3], counts: [0.0; LEVELS] };
 
-    fn closed(&self) -> Option<Column> {
+    fn closed(&self) -> Option<HistogramColumn> {
         let count: f64 = self.counts.iter().sum();
         let cells = self.counts.iter().zip(0..=u8::MAX).filter(|&(&count, _)| count > 0.0);
-        let cells = cells.map(|(&count, level)| Cell { level, count }).collect();
+        let cells = cells.map(|(&count, level)| HistogramCell { level, count }).collect();
         let [sum_x, sum_y, sum_y2] = self.sums;
-        (count > 0.0).then(|| Column { x: sum_x / count, count, sum_y, sum_y2, cells })
+        (count > 0.0).then(|| HistogramColumn { x: sum_x / count, count, sum_y, sum_y2, cells })
     }
 }
 
 impl Histogram {
     /// The histogram of one plane, (H, W) each: one column per dark value, exact for 8-bit photographs. Reference
     /// values are clamped to [0, 1], dark values as in [`Statistics`](crate::photographs::tone::Statistics).
-    pub fn of(dark: &[f32], reference: &[f32]) -> Self {
+    pub fn new(dark: &[f32], reference: &[f32]) -> Self {
         let key = |x: f32| (measurable(x).to_bits() >> KEY_SHIFT) as usize;
         let mut columns = vec![0_u32; LARGEST_KEY + 1];
         for &x in dark {
@@ -131,7 +131,7 @@ impl Histogram {
     /// column.
     pub fn residuals(&self, f: impl Fn(f64) -> f64) -> [f64; 2] {
         self.columns.iter().fold([0.0; 2], |[sum, squares], column| {
-            let (y, Column { count, sum_y, sum_y2, .. }) = (f(column.x), column);
+            let (y, HistogramColumn { count, sum_y, sum_y2, .. }) = (f(column.x), column);
             [sum + sum_y - count * y, squares + sum_y2 - 2.0 * y * sum_y + count * y * y]
         })
     }
@@ -145,7 +145,7 @@ mod tests {
     fn sums_are_those_of_the_pixels_for_any_pooling() {
         let dark: Vec<f32> = (0..5000).map(|i| (i % 61) as f32 / 255.0).collect();
         let reference: Vec<f32> = (0..5000).map(|i| (i * 7 % 256) as f32 / 255.0).collect();
-        let histogram = Histogram::of(&dark, &reference);
+        let histogram = Histogram::new(&dark, &reference);
         assert_eq!(histogram.columns.len(), 61);
         let f = |x: f64| 3.0 * x;
         let direct = dark.iter().zip(&reference).map(|(&x, &y)| f64::from(y) - f(x.into()));
@@ -167,11 +167,11 @@ mod tests {
     #[test]
     fn invalid_values_and_empty_planes_are_counted_as_in_the_statistics() {
         let histogram =
-            Histogram::of(&[f32::NAN, -1.0, f32::INFINITY, 1e9], &[2.0, f32::NAN, 0.5, 0.5]);
+            Histogram::new(&[f32::NAN, -1.0, f32::INFINITY, 1e9], &[2.0, f32::NAN, 0.5, 0.5]);
         let x: Vec<f64> = histogram.columns.iter().map(|column| column.x).collect();
         assert_eq!(x, [0.0, 65504.0]);
         assert_eq!(histogram.columns[0].sum_y, 1.0);
-        assert!(Histogram::of(&[], &[]).columns.is_empty());
+        assert!(Histogram::new(&[], &[]).columns.is_empty());
         assert!(Histogram::pooled([], 8).columns.is_empty());
     }
 }

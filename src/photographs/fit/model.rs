@@ -17,7 +17,7 @@ const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
 
 /// A family with the list of its fitted values.
 #[derive(Clone, Debug)]
-pub(super) struct Model {
+pub(super) struct FitModel {
     pub(super) family: &'static Family,
     slots: Vec<Variable>,
     /// In the order of every vector of values.
@@ -26,12 +26,12 @@ pub(super) struct Model {
 
 /// The effect of a photograph's exposure on its curve.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Exposure {
+pub(super) struct ChannelExposure {
     statistics: Statistics,
     channel: usize,
 }
 
-impl Exposure {
+impl ChannelExposure {
     /// For several photographs together: only t matters.
     pub(super) const POOLED: Self = Self {
         statistics: Statistics {
@@ -45,7 +45,7 @@ impl Exposure {
         channel: 0,
     };
 
-    pub(super) fn of(statistics: Statistics, channel: usize) -> Self {
+    pub(super) fn new(statistics: Statistics, channel: usize) -> Self {
         Self { statistics, channel }
     }
 
@@ -54,7 +54,7 @@ impl Exposure {
     }
 }
 
-impl Model {
+impl FitModel {
     pub(super) fn new(family: &'static Family, options: &FitOptions) -> Result<Self> {
         let mut slots: Vec<Variable> =
             (0..family.constants.len()).map(Variable::Constant).collect();
@@ -121,12 +121,12 @@ impl Model {
     }
 
     /// The curve of a photograph of this exposure with these values.
-    pub(super) fn curve(&self, values: &[f64], exposure: &Exposure) -> CurveOfT<f64> {
+    pub(super) fn curve(&self, values: &[f64], exposure: &ChannelExposure) -> CurveOfT<f64> {
         curve_of(&self.settings(values), exposure, |_, value| value)
     }
 
     /// [`Self::curve`] with its derivatives with respect to every value.
-    pub(super) fn slopes(&self, values: &[f64], exposure: &Exposure) -> Slopes {
+    pub(super) fn slopes(&self, values: &[f64], exposure: &ChannelExposure) -> Slopes {
         let settings = self.settings(values);
         let by = |&variable: &Variable| {
             curve_of(&settings, exposure, |of, value| {
@@ -141,7 +141,7 @@ impl Model {
 /// The curve of a photograph of this exposure, or of one of its channels.
 fn curve_of<T: Real>(
     settings: &ToneSettings,
-    exposure: &Exposure,
+    exposure: &ChannelExposure,
     number: impl Fn(Variable, f64) -> T,
 ) -> CurveOfT<T> {
     let mut curve = settings.curve_of(&exposure.statistics, number);
@@ -166,7 +166,7 @@ impl<T: Real> CurveOfT<T> {
 
     /// At t, unclamped.
     pub(super) fn raw_at(&self, t: f64) -> T {
-        self.curve.at(T::of(t * self.p90))
+        self.curve.at(T::from_f64(t * self.p90))
     }
 }
 
@@ -194,7 +194,7 @@ fn counted(number: Dual) -> f64 {
 pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
     let [mut count, mut squares] = [0.0; 2];
     for (channel, histogram) in pair.channels.iter().enumerate() {
-        let exposure = Exposure::of(pair.statistics, channel);
+        let exposure = ChannelExposure::new(pair.statistics, channel);
         let curve = curve_of(settings, &exposure, |_, value| value);
         squares += histogram.residuals(|x| curve.at(x / exposure.p90()))[1];
         count += histogram.count();
@@ -222,7 +222,7 @@ mod tests {
             let parameters = settings.parameters(&statistics);
             for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
                 for channel in 0..3 {
-                    let exposure = Exposure::of(statistics, channel);
+                    let exposure = ChannelExposure::new(statistics, channel);
                     let curve = curve_of(&settings, &exposure, |_, value| value);
                     let found = curve.at(x / exposure.p90());
                     let expected = if family.curve == ToneCurve::PerChannel {
@@ -247,10 +247,10 @@ mod tests {
             mean: 0.14,
             channel_means: [0.14; 3],
         };
-        let exposure = Exposure::of(statistics, 1);
+        let exposure = ChannelExposure::new(statistics, 1);
         for family in FAMILIES.iter().filter(|family| family.white != White::One) {
-            let model =
-                Model::new(family, &FitOptions { adapt: true, ..FitOptions::default() }).unwrap();
+            let model = FitModel::new(family, &FitOptions { adapt: true, ..FitOptions::default() })
+                .unwrap();
             let values: Vec<f64> = model.free.iter().map(|constant| constant.start).collect();
             for t in [0.05, 0.17, 0.61] {
                 for (index, exact) in model.slopes(&values, &exposure).raw_at(t).enumerate() {

@@ -17,7 +17,7 @@ const NORMAL_FOLDERS: [&str; 3] = ["high", "normal", "images"];
 
 /// Pairs of one scene.
 #[derive(Clone, Debug)]
-pub struct Scene<P> {
+pub struct PairScene<P> {
     /// The folder's name.
     pub name: String,
     /// By name; none of them black.
@@ -25,7 +25,7 @@ pub struct Scene<P> {
 }
 
 /// Pairs as histograms.
-pub type FitScene = Scene<Pair>;
+pub type FitScene = PairScene<Pair>;
 
 /// A dark photograph and its reference, reduced to the data that a fit requires.
 #[derive(Clone, Debug)]
@@ -55,10 +55,10 @@ impl Pair {
         };
         Ok(Self {
             path,
-            statistics: Statistics::of(&dark.data),
+            statistics: Statistics::new(&dark.data),
             channels: [0, 1, 2]
-                .map(|channel| Histogram::of(plane(dark, channel), plane(reference, channel))),
-            luminance: Histogram::of(&luminances(dark), &luminances(reference)),
+                .map(|channel| Histogram::new(plane(dark, channel), plane(reference, channel))),
+            luminance: Histogram::new(&luminances(dark), &luminances(reference)),
         })
     }
 
@@ -96,7 +96,7 @@ impl FitScene {
             Pair::new(dark, &image?, &bright?)
         };
         let mut pairs = files.par_iter().map(load).collect::<Result<Vec<Pair>>>()?;
-        colours.say();
+        colours.log();
         pairs.retain(|pair| {
             if pair.is_black() {
                 tracing::warn!("left out: {} is black", pair.path.display());
@@ -127,7 +127,7 @@ pub(super) fn files_of(folder: &Path, normal: Option<&Path>) -> Result<(Vec<File
         None => subfolders(folder)?,
     };
     let (mut darks, mut references) = (photographs(&dark)?, photographs(&normal)?);
-    let alone = darks.keys().find(|name| !references.contains_key(*name)).cloned();
+    let unpaired = darks.keys().find(|name| !references.contains_key(*name)).cloned();
     let count = darks.len();
     darks.retain(|name, _| references.contains_key(name));
     references.retain(|name, _| darks.contains_key(name));
@@ -136,7 +136,7 @@ pub(super) fn files_of(folder: &Path, normal: Option<&Path>) -> Result<(Vec<File
             format!("no photograph has a partner of the same name in {}", normal.display());
         return Err(Error::input(dark, problem));
     }
-    if let Some(name) = alone {
+    if let Some(name) = unpaired {
         let (left, normal) = (count - darks.len(), normal.display());
         tracing::warn!(
             "{}: {left} of {count} have no partner in {normal} ({name} is the first)",

@@ -18,8 +18,8 @@ use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::pairs::{Scene, check_sizes, files_of, name_of};
-use super::validate::{Part, all_except, split};
+use super::pairs::{PairScene, check_sizes, files_of, name_of};
+use super::validate::{HeldOutPairs, all_except, split};
 use crate::kernels::pseudo_gt::SEGMENTS;
 use crate::photographs::image::{ColourCounts, Image};
 use crate::photographs::tone::{Exposure, LuminanceHistogram, Profile, measurable, soft};
@@ -44,7 +44,7 @@ const MIN_SCALE: f64 = 0.25 / 255.0;
 const UNITS: f64 = 1e4;
 
 /// The pairs of a scene as colours, normalised to one exposure.
-pub type ColourScene = Scene<ColourPair>;
+pub type ColourScene = PairScene<ColourPair>;
 
 /// Dark colours of a photograph times its gain, and the colours of its reference.
 #[derive(Clone, Debug)]
@@ -86,8 +86,8 @@ impl ColourScene {
             sampled(dark, &image?, &bright?, share)
         };
         let photographs = files.par_iter().map(load).collect::<Result<Vec<_>>>()?;
-        colours.say();
-        let Some(exposure) = Exposure::of(photographs.iter().map(|(_, y)| y), None) else {
+        colours.log();
+        let Some(exposure) = Exposure::measure(photographs.iter().map(|(_, y)| y), None) else {
             let problem = "every photograph is almost black: a profile needs at least one pair";
             return Err(Error::input(dark, problem));
         };
@@ -121,7 +121,7 @@ fn sampled(
     let step = (pixels / count).max(1) | 1;
     let both = |i| [colour(dark, i), colour(reference, i).map(|y| y.min(1.0))];
     let colours = (0..pixels).step_by(step).map(both).collect();
-    let luminance = LuminanceHistogram::of(&dark.data);
+    let luminance = LuminanceHistogram::new(&dark.data);
     Ok((ColourPair { path: path.to_owned(), colours }, luminance))
 }
 
@@ -344,7 +344,7 @@ pub fn cross_validate_profile(
     huber: f64,
 ) -> Result<Vec<ProfileFold>> {
     let parts = split(scenes, folds)?;
-    let held_out = |(index, part): (usize, &Part<'_, ColourPair>)| {
+    let held_out = |(index, part): (usize, &HeldOutPairs<'_, ColourPair>)| {
         let others = all_except(&parts, index);
         let others: Vec<_> = others.map(|part| (part.scene, part.pairs.clone())).collect();
         let profile = fit_profile(&others, huber)?;

@@ -3,20 +3,20 @@
 use levenberg_marquardt::{LeastSquaresProblem, LevenbergMarquardt};
 use nalgebra::{DMatrix, DVector, Dyn, Owned};
 
-use super::model::{CurveOfT, Exposure, Model, Slopes};
+use super::model::{ChannelExposure, CurveOfT, FitModel, Slopes};
 use super::{Channels, FitOptions, Histogram, Pair, Weighting};
 use crate::base::random::Stream;
 use crate::photographs::tone::{Constant, Statistics};
 
 /// Values with the same curve of t.
 pub(super) struct Group {
-    pub(super) exposure: Exposure,
+    pub(super) exposure: ChannelExposure,
     /// Of t = x / p90.
     pub(super) histogram: Histogram,
 }
 
 /// The pairs with their weights, grouped by curve: a single group if only t matters.
-fn groups(model: &Model, pairs: &[&Pair], weights: &[f64], options: &FitOptions) -> Vec<Group> {
+fn groups(model: &FitModel, pairs: &[&Pair], weights: &[f64], options: &FitOptions) -> Vec<Group> {
     let all = pairs.iter().zip(weights).flat_map(|(pair, &weight)| {
         parts(model, pair, options.channels).into_iter().map(move |(exposure, histograms)| {
             let scaled = |histogram| (histogram, [1.0 / exposure.p90(), weight]);
@@ -28,17 +28,17 @@ fn groups(model: &Model, pairs: &[&Pair], weights: &[f64], options: &FitOptions)
     if model.differs_by_photograph() {
         all.map(group).collect()
     } else {
-        vec![group((Exposure::POOLED, all.flat_map(|(_, parts)| parts).collect()))]
+        vec![group((ChannelExposure::POOLED, all.flat_map(|(_, parts)| parts).collect()))]
     }
 }
 
 /// The fitted histograms of a pair, with their exposures.
 pub(super) fn parts<'a>(
-    model: &Model,
+    model: &FitModel,
     pair: &'a Pair,
     channels: Channels,
-) -> Vec<(Exposure, Vec<&'a Histogram>)> {
-    let exposure = |channel| Exposure::of(pair.statistics, channel);
+) -> Vec<(ChannelExposure, Vec<&'a Histogram>)> {
+    let exposure = |channel| ChannelExposure::new(pair.statistics, channel);
     if model.differs_by_channel() {
         return (0..3).map(|channel| (exposure(channel), vec![&pair.channels[channel]])).collect();
     }
@@ -51,7 +51,7 @@ pub(super) fn parts<'a>(
 
 /// The number of fitted values of a pair, and the sums of their residuals and of the squares.
 pub(super) fn pair_residuals(
-    model: &Model,
+    model: &FitModel,
     values: &[f64],
     pair: &Pair,
     channels: Channels,
@@ -61,7 +61,7 @@ pub(super) fn pair_residuals(
     for (exposure, histogram) in
         parts.flat_map(|(exposure, parts)| parts.into_iter().map(move |part| (exposure, part)))
     {
-        let pooled = if model.differs_by_photograph() { exposure } else { Exposure::POOLED };
+        let pooled = if model.differs_by_photograph() { exposure } else { ChannelExposure::POOLED };
         let curve = model.curve(values, &pooled);
         let [sum, squares] = histogram.residuals(|x| curve.at(x / exposure.p90()));
         found.0 += histogram.count();
@@ -84,7 +84,7 @@ pub(super) struct Solution {
 }
 
 /// A column with its weight and its mean reference value, under the weights of its cells.
-struct Row {
+struct FitRow {
     group: usize,
     t: f64,
     /// The sum of all weights.
@@ -114,23 +114,23 @@ const SETTLED: f64 = 1e-6;
 const MIN_SCALE: f64 = 0.25 / 255.0;
 
 pub(super) struct Solver<'a> {
-    model: &'a Model,
+    model: &'a FitModel,
     pairs: &'a [&'a Pair],
     options: &'a FitOptions,
     pub(super) groups: Vec<Group>,
     /// Points at which constraints are tested, for a photograph of mean statistics.
     grid: Vec<f64>,
-    exposure: Exposure,
+    exposure: ChannelExposure,
 }
 
 impl<'a> Solver<'a> {
-    pub(super) fn new(model: &'a Model, pairs: &'a [&'a Pair], options: &'a FitOptions) -> Self {
+    pub(super) fn new(model: &'a FitModel, pairs: &'a [&'a Pair], options: &'a FitOptions) -> Self {
         let groups = groups(model, pairs, &vec![1.0; pairs.len()], options);
         let exposure = if model.differs_by_photograph() {
             let statistics: Vec<Statistics> = pairs.iter().map(|pair| pair.statistics).collect();
-            Exposure::of(Statistics::mean_of(&statistics).unwrap_or_default(), 0)
+            ChannelExposure::new(Statistics::mean_of(&statistics).unwrap_or_default(), 0)
         } else {
-            Exposure::POOLED
+            ChannelExposure::POOLED
         };
         let last = groups.iter().filter_map(|group| group.histogram.columns.last());
         let end = last.map(|column| column.x).fold(MIN_END, f64::max);
@@ -213,7 +213,7 @@ impl<'a> Solver<'a> {
 
     /// A row per column, drawn towards the family's own curve by the prior. The model has one value within a column, so
     /// only the weighted mean matters. Without values, cells are weighted by their counts.
-    fn rows(&self, weight: &dyn Fn(f64) -> f64, values: &[f64]) -> Vec<Row> {
+    fn rows(&self, weight: &dyn Fn(f64) -> f64, values: &[f64]) -> Vec<FitRow> {
         let (mut rows, curves) = (vec![], self.curves(values));
         for (index, group) in self.groups.iter().enumerate() {
             for column in &group.histogram.columns {
@@ -227,7 +227,7 @@ impl<'a> Solver<'a> {
                         [sum + weight, sum_y + weight * cell.y()]
                     })
                 };
-                rows.push(Row { group: index, t, weight, y: sum_y / weight });
+                rows.push(FitRow { group: index, t, weight, y: sum_y / weight });
             }
         }
         let total: f64 = rows.iter().map(|row| row.weight).sum();
@@ -244,7 +244,7 @@ impl<'a> Solver<'a> {
     }
 
     /// The best result of several starts.
-    fn best_of_many_starts(&self, rows: &[Row]) -> Vec<f64> {
+    fn best_of_many_starts(&self, rows: &[FitRow]) -> Vec<f64> {
         let free = &self.model.free;
         let start: Vec<f64> = free.iter().map(|constant| constant.start).collect();
         let stream = Stream::new(u64::from(self.model.family.curve.constant()), 0);
@@ -266,7 +266,7 @@ impl<'a> Solver<'a> {
         found.min_by(|a, b| a.0.total_cmp(&b.0)).map_or_else(Vec::new, |(_, values)| values)
     }
 
-    fn minimize(&self, rows: &[Row], start: &[f64]) -> Vec<f64> {
+    fn minimize(&self, rows: &[FitRow], start: &[f64]) -> Vec<f64> {
         let mut values = start.to_vec();
         for strength in STRENGTHS {
             let problem = self.problem(rows, &values, strength);
@@ -287,7 +287,7 @@ impl<'a> Solver<'a> {
         values
     }
 
-    fn problem<'b>(&'b self, rows: &'b [Row], start: &[f64], strength: f64) -> Problem<'b> {
+    fn problem<'b>(&'b self, rows: &'b [FitRow], start: &[f64], strength: f64) -> Problem<'b> {
         let position =
             self.model.free.iter().zip(start).map(|(constant, value)| place_of(constant, *value));
         let position = DVector::from_iterator(start.len(), position);
@@ -347,7 +347,7 @@ pub(super) fn quantile(sizes: &mut [(f64, f64)], share: f64) -> f64 {
 /// Residuals: one per row, then two per point of the grid, which are 0 if the constraint is satisfied.
 struct Problem<'a> {
     solver: &'a Solver<'a>,
-    rows: &'a [Row],
+    rows: &'a [FitRow],
     strength: f64,
     values: Vec<f64>,
     position: DVector<f64>,
@@ -364,7 +364,7 @@ impl Problem<'_> {
 
     fn all_residuals(&self) -> DVector<f64> {
         let curves = self.solver.curves(&self.values);
-        let residual = |row: &Row| row.weight.sqrt() * (curves[row.group].at(row.t) - row.y);
+        let residual = |row: &FitRow| row.weight.sqrt() * (curves[row.group].at(row.t) - row.y);
         let mut residuals: Vec<f64> = self.rows.iter().map(residual).collect();
         if self.is_constrained() {
             let broken = self.solver.broken(&self.values);

@@ -2,8 +2,8 @@
 
 use serde::Serialize;
 
-use super::pairs::Scene;
-use super::{FitOptions, FitScene, Pair, Scores, fit, mean_psnr, mean_squared_error};
+use super::pairs::PairScene;
+use super::{CurveScores, FitOptions, FitScene, Pair, fit, mean_psnr, mean_squared_error};
 use crate::photographs::tone::Family;
 use crate::{Error, Result};
 
@@ -15,9 +15,9 @@ pub struct Fold {
     /// Its number of pairs.
     pub pairs: usize,
     /// The mean PSNR of its pairs, dB, for a fit to all others.
-    pub psnr: Scores,
+    pub psnr: CurveScores,
     /// The mean squared error of its pairs, for values in [0, 1].
-    pub squared_error: Scores,
+    pub squared_error: CurveScores,
 }
 
 /// Scores on held-out pairs.
@@ -26,9 +26,9 @@ pub struct HeldOut {
     /// One per fit.
     pub folds: Vec<Fold>,
     /// The means over the folds, dB.
-    pub psnr: Scores,
+    pub psnr: CurveScores,
     /// The means over the folds, of values in [0, 1].
-    pub squared_error: Scores,
+    pub squared_error: CurveScores,
 }
 
 /// Fits to all scenes except one, for each in turn; in a single scene, to all except every `folds`-th pair.
@@ -39,27 +39,27 @@ pub fn cross_validate(
     options: &FitOptions,
 ) -> Result<HeldOut> {
     let parts = split(scenes, folds)?;
-    let held_out = |(index, Part { name, pairs, .. }): (usize, &Part<'_, Pair>)| {
+    let held_out = |(index, HeldOutPairs { name, pairs, .. }): (usize, &HeldOutPairs<'_, Pair>)| {
         let others = all_except(&parts, index).flat_map(|part| &part.pairs);
         let others: Vec<&Pair> = others.copied().collect();
         let fitted = fit(family, &others, options)?;
         Ok(Fold {
             name: name.clone(),
             pairs: pairs.len(),
-            psnr: Scores::of(&fitted.settings, |settings| mean_psnr(settings, pairs)),
-            squared_error: Scores::of(&fitted.settings, |settings| {
+            psnr: CurveScores::new(&fitted.settings, |settings| mean_psnr(settings, pairs)),
+            squared_error: CurveScores::new(&fitted.settings, |settings| {
                 mean_squared_error(settings, pairs)
             }),
         })
     };
     let folds = parts.iter().enumerate().map(held_out).collect::<Result<Vec<Fold>>>()?;
-    let psnr = Scores::mean(folds.iter().map(|fold| &fold.psnr));
-    let squared_error = Scores::mean(folds.iter().map(|fold| &fold.squared_error));
+    let psnr = CurveScores::mean(folds.iter().map(|fold| &fold.psnr));
+    let squared_error = CurveScores::mean(folds.iter().map(|fold| &fold.squared_error));
     Ok(HeldOut { folds, psnr, squared_error })
 }
 
 /// A scene, or a part of one, that is held out.
-pub(super) struct Part<'a, P> {
+pub(super) struct HeldOutPairs<'a, P> {
     pub(super) name: String,
     /// The name of the scene.
     pub(super) scene: &'a str,
@@ -67,9 +67,12 @@ pub(super) struct Part<'a, P> {
 }
 
 /// The scenes; of a single one, `folds` parts.
-pub(super) fn split<'a, P>(scenes: &'a [Scene<P>], folds: usize) -> Result<Vec<Part<'a, P>>> {
-    let [Scene { name, pairs }] = scenes else {
-        let whole = |scene: &'a Scene<P>| Part {
+pub(super) fn split<'a, P>(
+    scenes: &'a [PairScene<P>],
+    folds: usize,
+) -> Result<Vec<HeldOutPairs<'a, P>>> {
+    let [PairScene { name, pairs }] = scenes else {
+        let whole = |scene: &'a PairScene<P>| HeldOutPairs {
             name: scene.name.clone(),
             scene: &scene.name,
             pairs: scene.pairs.iter().collect(),
@@ -83,7 +86,7 @@ pub(super) fn split<'a, P>(scenes: &'a [Scene<P>], folds: usize) -> Result<Vec<P
             pairs.len()
         )));
     }
-    let part = |index: usize| Part {
+    let part = |index: usize| HeldOutPairs {
         name: format!("{name} {}/{count}", index + 1),
         scene: name,
         pairs: pairs.iter().skip(index).step_by(count).collect(),
@@ -93,8 +96,8 @@ pub(super) fn split<'a, P>(scenes: &'a [Scene<P>], folds: usize) -> Result<Vec<P
 
 /// All parts except one.
 pub(super) fn all_except<'a, 'p, P>(
-    parts: &'a [Part<'p, P>],
+    parts: &'a [HeldOutPairs<'p, P>],
     index: usize,
-) -> impl Iterator<Item = &'a Part<'p, P>> {
+) -> impl Iterator<Item = &'a HeldOutPairs<'p, P>> {
     parts.iter().enumerate().filter(move |(other, _)| *other != index).map(|(_, part)| part)
 }

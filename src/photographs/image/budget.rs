@@ -4,7 +4,7 @@ use std::io::Cursor;
 use std::path::Path;
 
 use super::exr_file;
-use super::source::{Source, reader};
+use super::source::{BufReadSeek, reader};
 use crate::{Error, Result};
 
 /// More than any camera: 16 384 x 16 384.
@@ -36,7 +36,7 @@ fn excess_of_size(width: u64, height: u64) -> Option<String> {
 }
 
 fn excess_of_exr(bytes: &[u8]) -> Option<String> {
-    let bytes: Box<dyn Source> = Box::new(Cursor::new(bytes));
+    let bytes: Box<dyn BufReadSeek> = Box::new(Cursor::new(bytes));
     let meta = exr::meta::MetaData::read_from_buffered(bytes, false).ok()?;
     let size = |header: &exr::meta::header::Header| {
         [header.layer_size.width(), header.layer_size.height()].map(|side| side as u64)

@@ -13,7 +13,7 @@ use super::colour::{self, ColourCounts};
 #[cfg(not(feature = "raw"))]
 use super::files::RAW_REMEDY;
 use super::files::{HEIC_REMEDY, is_raw};
-use super::source::{Decoded, Meaning, Source, not_an_image, reader};
+use super::source::{BufReadSeek, DecodedImage, Meaning, not_an_image, reader};
 use super::{Image, Orientation, budget, exr_file, from_interleaved, jpeg, linear_from_srgb};
 use crate::base::output::write_whole;
 use crate::base::{input, tree};
@@ -55,13 +55,14 @@ impl PictureFile {
 
     /// [`Self::decode`] that counts colour conversions in `counters` instead of logging them.
     pub(crate) fn decode_counted(self, counters: &ColourCounts) -> Result<(Image, Option<Image>)> {
-        let Decoded { image, alpha, conversion } = decode(&self.path, self.bytes, Meaning::Colour)?;
+        let DecodedImage { image, alpha, conversion } =
+            decode(&self.path, self.bytes, Meaning::Colour)?;
         counters.add(conversion);
         Ok((image, alpha))
     }
 }
 
-fn decode(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Decoded> {
+fn decode(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<DecodedImage> {
     budget::check(path, &bytes)?;
     if bytes.starts_with(&exr_file::MAGIC) {
         return exr_file::load(path, bytes, meaning);
@@ -73,7 +74,7 @@ fn decode(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Decoded> {
         None => {
             refuse_heic(path, &bytes)?;
             if is_raw(path) {
-                return Ok(Decoded::as_stored(load_raw(path, bytes)?, None));
+                return Ok(DecodedImage::as_stored(load_raw(path, bytes)?, None));
             }
             let reader = reader(Cursor::new(bytes.as_slice()));
             let decoded = reader.map_err(ImageError::from).and_then(ImageReader::decode);
@@ -83,10 +84,10 @@ fn decode(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Decoded> {
         }
     };
     if meaning == Meaning::Number {
-        return Ok(Decoded::as_stored(image, alpha));
+        return Ok(DecodedImage::as_stored(image, alpha));
     }
     let conversion = colour::convert(&mut image, &bytes);
-    Ok(Decoded { image, alpha, conversion })
+    Ok(DecodedImage { image, alpha, conversion })
 }
 
 /// The alpha of a decoded image in all three planes; `None` if it is opaque.
@@ -122,7 +123,7 @@ pub(crate) mod openings {
     }
 }
 
-fn file_reader(path: &Path) -> Result<ImageReader<Box<dyn Source>>> {
+fn file_reader(path: &Path) -> Result<ImageReader<Box<dyn BufReadSeek>>> {
     #[cfg(test)]
     openings::count(path);
     let opened = tree::open(path).and_then(|file| reader(BufReader::new(file)));
@@ -133,7 +134,10 @@ fn unreadable(path: &Path, error: &std::io::Error) -> Error {
     Error::input(path, format!("cannot be read: {error}"))
 }
 
-fn size_of_reader(path: &Path, reader: ImageReader<Box<dyn Source + '_>>) -> Result<(u32, u32)> {
+fn size_of_reader(
+    path: &Path,
+    reader: ImageReader<Box<dyn BufReadSeek + '_>>,
+) -> Result<(u32, u32)> {
     if reader.format() != Some(ImageFormat::OpenExr) {
         return reader.into_dimensions().map_err(|error| not_an_image(path, &error));
     }
@@ -158,7 +162,7 @@ impl Image {
     /// [`Error::Input`] if the file cannot be read, is truncated or has another format.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
         let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
-        let Decoded { image, conversion, .. } = decode(&path, bytes, Meaning::Colour)?;
+        let DecodedImage { image, conversion, .. } = decode(&path, bytes, Meaning::Colour)?;
         if let Some(problem) = conversion.unknown {
             tracing::warn!("{}: {problem} is not used; the colours count as sRGB", path.display());
         }

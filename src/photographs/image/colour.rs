@@ -47,7 +47,7 @@ const LEVELS: f32 = 65_535.0;
 pub(super) fn convert(image: &mut Image, bytes: &[u8]) -> Conversion {
     let mut unknown = None;
     for statement in statements(bytes) {
-        match ColourSpace::of(&statement) {
+        match ColourSpace::from_statement(&statement) {
             Ok(None) => return Conversion { from: None, unknown },
             Ok(Some(space)) => {
                 let outside = space.apply(image);
@@ -136,7 +136,7 @@ struct ColourSpace {
 
 impl ColourSpace {
     /// `None` for sRGB.
-    fn of(statement: &Statement) -> Result<Option<Self>, String> {
+    fn from_statement(statement: &Statement) -> Result<Option<Self>, String> {
         let space = match statement {
             Statement::Srgb => return Ok(None),
             Statement::AdobeRgb => Self::of_profile(&ColorProfile::new_adobe_rgb()),
@@ -177,8 +177,8 @@ impl ColourSpace {
                 let (matrix, curves) =
                     matrix.zip(curves).ok_or_else(|| unusable("no matrix and curves"))?;
                 // If the primaries are sRGB's and the curve is another, their name says nothing.
-                let known = known_name(matrix).filter(|known| *known != "sRGB");
-                Ok(Self { name: known.map_or(name, str::to_owned), curves, matrix })
+                let standard = known_name(matrix).filter(|standard| *standard != "sRGB");
+                Ok(Self { name: standard.map_or(name, str::to_owned), curves, matrix })
             }
             other => Err(unusable(&format!("for {other:?}, not for RGB"))),
         }
@@ -223,8 +223,8 @@ impl ColourSpace {
             true => srgb_curve(),
             false => Box::new(move |value: f32| transfer.linearize(f64::from(value)) as f32),
         };
-        let known = known_name(matrix).filter(|known| *known != "sRGB");
-        let name = known.map_or_else(|| format!("code points {points:?}"), str::to_owned);
+        let standard = known_name(matrix).filter(|standard| *standard != "sRGB");
+        let name = standard.map_or_else(|| format!("code points {points:?}"), str::to_owned);
         Ok(Self { name, curves: std::array::from_fn(curve), matrix })
     }
 
@@ -236,13 +236,13 @@ impl ColourSpace {
             Some(chromaticities) => to_srgb(chromaticities).ok_or("invalid chromaticities")?,
             None => DMat3::IDENTITY,
         };
-        let known = known_name(matrix);
+        let standard = known_name(matrix);
         // Without a chunk of its own, the curve of sRGB and Display P3 is written as 1/2.2; ffmpeg writes that of
         // video, which is shown as sRGB, as 1/1.961.
         let is_srgb_curve = |exponent: &f64| {
             let is_near = |of: f64, by: f64| (exponent - of).abs() < by;
             is_near(1.961, 0.005)
-                || is_near(2.2, 0.03) && [Some("sRGB"), Some("Display P3")].contains(&known)
+                || is_near(2.2, 0.03) && [Some("sRGB"), Some("Display P3")].contains(&standard)
         };
         let exponent = exponent.filter(|exponent| !is_srgb_curve(exponent));
         let curve = |_| match exponent {
@@ -251,9 +251,9 @@ impl ColourSpace {
             }
             None => srgb_curve(),
         };
-        let primaries = known.unwrap_or("other primaries");
+        let primaries = standard.unwrap_or("other primaries");
         let name = match exponent {
-            Some(exponent) if known != Some("Adobe RGB") => {
+            Some(exponent) if standard != Some("Adobe RGB") => {
                 format!("{primaries} at gamma {exponent:.2}")
             }
             _ => primaries.to_owned(),
@@ -331,7 +331,7 @@ fn description(profile: &ColorProfile) -> Option<String> {
 /// The name of the colour space with these primaries, from the matrix to linear sRGB.
 fn known_name(matrix: DMat3) -> Option<&'static str> {
     static KNOWN: OnceLock<[(&str, Option<DMat3>); 5]> = OnceLock::new();
-    let known = KNOWN.get_or_init(|| {
+    let spaces = KNOWN.get_or_init(|| {
         let profiles = [
             ("sRGB", ColorProfile::new_srgb()),
             ("Display P3", ColorProfile::new_display_p3()),
@@ -344,5 +344,5 @@ fn known_name(matrix: DMat3) -> Option<&'static str> {
     let is_near = |primaries: Option<DMat3>| {
         primaries.is_some_and(|primaries| primaries.abs_diff_eq(matrix, 0.01))
     };
-    known.iter().find(|(_, primaries)| is_near(*primaries)).map(|(name, _)| *name)
+    spaces.iter().find(|(_, primaries)| is_near(*primaries)).map(|(name, _)| *name)
 }

@@ -7,7 +7,7 @@ use exr::meta::attribute::AttributeValue;
 use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableImage};
 
 use super::colour::{self, Chromaticities, Conversion};
-use super::source::{Decoded, Meaning, Source, not_an_image};
+use super::source::{BufReadSeek, DecodedImage, Meaning, not_an_image};
 use super::{Image, srgb_from_linear};
 use crate::base::output::write_whole;
 use crate::{Error, Result};
@@ -17,7 +17,7 @@ pub(super) const MAGIC: [u8; 4] = [0x76, 0x2F, 0x31, 0x01];
 
 /// The first layer's R, G and B (or Y), and the mask of its finite pixels. Colours are encoded as sRGB; those that are
 /// negative or not finite become 0, with a warning that counts them.
-pub(super) fn load(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Decoded> {
+pub(super) fn load(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<DecodedImage> {
     let (mut image, chromaticities) = decoded(path, bytes)?;
     let alpha = finite_part(&image);
     let conversion = match chromaticities {
@@ -43,7 +43,7 @@ pub(super) fn load(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Deco
             path.display()
         );
     }
-    Ok(Decoded { image, alpha, conversion })
+    Ok(DecodedImage { image, alpha, conversion })
 }
 
 /// 1 at pixels whose values are all finite, 0 elsewhere, in all three planes; `None` if all are finite.
@@ -59,7 +59,7 @@ fn finite_part(Image { width, height, data }: &Image) -> Option<Image> {
 
 /// The first layer's R, G and B (or Y) as stored, and the chromaticities of its primaries.
 fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>)> {
-    let bytes: Box<dyn Source> = Box::new(Cursor::new(bytes));
+    let bytes: Box<dyn BufReadSeek> = Box::new(Cursor::new(bytes));
     let image = exr::prelude::read()
         .no_deep_data()
         .largest_resolution_level()

@@ -81,11 +81,11 @@ pub(crate) fn unread_in(folder: &Path) -> Option<String> {
 
 /// Finds photographs, and caches the listings of folders.
 #[derive(Debug, Default)]
-pub(crate) struct Files {
+pub(crate) struct PhotographFiles {
     folders: RefCell<HashMap<PathBuf, BTreeMap<String, PathBuf>>>,
 }
 
-impl Files {
+impl PhotographFiles {
     /// The file `folder/listed`; without one, the file there that differs only in its extension or in the Unicode
     /// normalisation of its name. A path that leads out of an archive is not found.
     pub(crate) fn find(&self, folder: &Path, listed: &str) -> Option<PathBuf> {

@@ -71,7 +71,8 @@ impl Mask {
         let inverted = inverted != *is_inverted;
         let mut mask = Image::load_as_stored(file)?;
         let size = (image.width, image.height);
-        let (shape, upright) = ((mask.width, mask.height), Orientation::of(photograph).size(size));
+        let (shape, upright) =
+            ((mask.width, mask.height), Orientation::from_file(photograph).size(size));
         let is_of_shape = |(width, height): (u32, u32)| {
             let [a, b] = [shape.0 * height, shape.1 * width].map(f64::from);
             (a - b).abs() <= f64::from(width.max(height).max(shape.0).max(shape.1))
@@ -153,8 +154,8 @@ impl Mask {
     }
 
     /// Whether one of the four pixels around a position, in pixels, is masked in part.
-    pub(crate) fn hides_around(&self, place: glam::DVec2) -> bool {
-        let [column, row] = (place - 0.5).floor().to_array();
+    pub(crate) fn hides_around(&self, position: glam::DVec2) -> bool {
+        let [column, row] = (position - 0.5).floor().to_array();
         let at = |value: f64, side: u32| (value.max(0.0) as u32).min(side - 1) as usize;
         [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)].into_iter().any(|(x, y)| {
             let (x, y) = (at(column + x, self.width), at(row + y, self.height));

@@ -24,7 +24,7 @@ impl Orientation {
     pub const UPRIGHT: Self = Self(1);
 
     /// The orientation of a file; upright if it has none.
-    pub fn of(path: &Path) -> Self {
+    pub fn from_file(path: &Path) -> Self {
         tree::open(path).map_or(Self::UPRIGHT, |file| Self::read(&mut BufReader::new(file)))
     }
 

@@ -10,15 +10,15 @@ use super::colour::Conversion;
 use crate::Error;
 
 /// A file or memory as one type: decoders are compiled for each type that they read from.
-pub(super) trait Source: BufRead + Seek {}
+pub(super) trait BufReadSeek: BufRead + Seek {}
 
-impl<T: BufRead + Seek> Source for T {}
+impl<T: BufRead + Seek> BufReadSeek for T {}
 
 /// A reader of an image, for the format of its content.
 pub(super) fn reader<'a>(
-    source: impl Source + 'a,
-) -> std::io::Result<ImageReader<Box<dyn Source + 'a>>> {
-    let source: Box<dyn Source> = Box::new(source);
+    source: impl BufReadSeek + 'a,
+) -> std::io::Result<ImageReader<Box<dyn BufReadSeek + 'a>>> {
+    let source: Box<dyn BufReadSeek> = Box::new(source);
     ImageReader::new(source).with_guessed_format()
 }
 
@@ -40,13 +40,13 @@ pub(super) enum Meaning {
 }
 
 /// The contents of a file.
-pub(super) struct Decoded {
+pub(super) struct DecodedImage {
     pub(super) image: Image,
     pub(super) alpha: Option<Image>,
     pub(super) conversion: Conversion,
 }
 
-impl Decoded {
+impl DecodedImage {
     /// Values that are not colours, or are sRGB already.
     pub(super) fn as_stored(image: Image, alpha: Option<Image>) -> Self {
         Self { image, alpha, conversion: Conversion::default() }

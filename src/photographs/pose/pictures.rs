@@ -8,14 +8,14 @@ use super::tone_mapped;
 pub(super) const BRIGHT: &str = "bright";
 
 /// Dark photographs, and bright ones of the same scene through which they are posed.
-pub(super) struct Pictures {
+pub(super) struct PosePhotographs {
     pub(super) dark: Vec<PathBuf>,
     pub(super) bright: Vec<PathBuf>,
     /// The folder of their tone-mapped copies.
     pub(super) copies: PathBuf,
 }
 
-impl Pictures {
+impl PosePhotographs {
     /// All photographs, the dark ones first.
     pub(super) fn all(&self) -> Vec<PathBuf> {
         [self.dark.as_slice(), self.bright.as_slice()].concat()

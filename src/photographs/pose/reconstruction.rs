@@ -3,10 +3,10 @@
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 
-use super::pictures::{Pictures, is_dark};
-use super::stages::Stage;
+use super::pictures::{PosePhotographs, is_dark};
+use super::stages::StageProgress;
 use super::tool::Tool;
-use super::{PoseOptions, Progress, cameras};
+use super::{PoseOptions, PoseProgress, cameras};
 use crate::base::output::create_folder;
 use crate::photographs::dataset::Dataset;
 use crate::{Error, Result};
@@ -131,8 +131,8 @@ impl<'a> Reconstruction<'a> {
     /// choice of the initial pair is relaxed.
     pub(super) fn models(
         mut self,
-        pictures: &Pictures,
-        report: &dyn Fn(Progress<'_>),
+        pictures: &PosePhotographs,
+        report: &dyn Fn(PoseProgress<'_>),
     ) -> Result<PathBuf> {
         let copies = pictures.copies.as_path();
         let everything = pictures.dark.len() + pictures.bright.len();
@@ -152,7 +152,7 @@ impl<'a> Reconstruction<'a> {
             return Ok(best);
         }
         let line = format!("{placed} of {all} have a camera: matching again, guided");
-        report(Progress::Line(&line));
+        report(PoseProgress::Line(&line));
         self.is_guided = true;
         self.use_folder("guided")?;
         self.database = features;
@@ -172,7 +172,7 @@ impl<'a> Reconstruction<'a> {
                 let line = format!(
                     "{placed} of {all} have a camera: registering again, from a closer pair"
                 );
-                report(Progress::Line(&line));
+                report(PoseProgress::Line(&line));
                 self.relaxed = relaxed;
                 self.use_folder(&format!("relaxed{step}"))?;
                 self.register(copies, report)?;
@@ -192,17 +192,17 @@ impl<'a> Reconstruction<'a> {
     }
 
     /// Extracts the features of each photograph. Those of one group share a camera.
-    fn extract(&self, pictures: &Pictures, report: &dyn Fn(Progress<'_>)) -> Result<()> {
+    fn extract(&self, pictures: &PosePhotographs, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
         let command = "feature_extractor";
         let photographs = pictures.all();
         let groups = cameras::groups(&photographs);
-        let (shared, alone): (Vec<_>, Vec<_>) =
+        let (shared, single): (Vec<_>, Vec<_>) =
             groups.into_iter().partition(|group| group.len() > 1);
-        let alone: Vec<&Path> = alone.concat();
+        let single: Vec<&Path> = single.concat();
         let mut runs: Vec<(Vec<&Path>, &str)> =
             shared.into_iter().map(|group| (group, "1")).collect();
-        if !alone.is_empty() {
-            runs.push((alone, "0"));
+        if !single.is_empty() {
+            runs.push((single, "0"));
         }
         let use_gpu = self.named(command, ["FeatureExtraction", "SiftExtraction"], "use_gpu");
         for (at, (group, is_one_camera)) in runs.iter().enumerate() {
@@ -221,7 +221,7 @@ impl<'a> Reconstruction<'a> {
             }
             self.run(&self.colmap, command, options, "features", report)?;
         }
-        report(Progress::Line(&match runs.len() {
+        report(PoseProgress::Line(&match runs.len() {
             1 => "features extracted".to_owned(),
             count => format!(
                 "features extracted; {count} groups of photographs by size, lens and focal length"
@@ -230,7 +230,7 @@ impl<'a> Reconstruction<'a> {
         Ok(())
     }
 
-    fn match_features(&self, count: usize, report: &dyn Fn(Progress<'_>)) -> Result<()> {
+    fn match_features(&self, count: usize, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
         let command = self.matcher.command();
         let of_matching = |option| self.named(command, ["FeatureMatching", "SiftMatching"], option);
         let mut options = vec![("database_path".to_owned(), self.database.clone().into())];
@@ -245,11 +245,11 @@ impl<'a> Reconstruction<'a> {
             options.push(("ExhaustiveMatching.block_size".to_owned(), block.to_string().into()));
         }
         self.run(&self.colmap, command, options, "matching", report)?;
-        report(Progress::Line("features matched"));
+        report(PoseProgress::Line("features matched"));
         Ok(())
     }
 
-    fn register(&self, tone_mapped: &Path, report: &dyn Fn(Progress<'_>)) -> Result<()> {
+    fn register(&self, tone_mapped: &Path, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
         let mut files = self.files(tone_mapped);
         files.push(("output_path".to_owned(), self.models.clone().into()));
         let run = |tool, command, files| self.run(tool, command, files, "registering", report);
@@ -272,7 +272,7 @@ impl<'a> Reconstruction<'a> {
             Err(_) if NO_INITIAL_PAIR.iter().any(|words| self.colmap.printed(words)) => {}
             outcome => outcome?,
         }
-        report(Progress::Line("cameras placed"));
+        report(PoseProgress::Line("cameras placed"));
         Ok(())
     }
 
@@ -283,7 +283,7 @@ impl<'a> Reconstruction<'a> {
         command: &str,
         mut options: Options,
         what: &str,
-        report: &dyn Fn(Progress<'_>),
+        report: &dyn Fn(PoseProgress<'_>),
     ) -> Result<()> {
         for (_, name, value) in self.user_options.iter().filter(|(of, ..)| *of == command) {
             options.retain(|(option, _)| option != name);
@@ -292,10 +292,10 @@ impl<'a> Reconstruction<'a> {
         let options: Vec<[OsString; 2]> =
             options.into_iter().map(|(name, value)| [format!("--{name}").into(), value]).collect();
         let arguments: Vec<&OsStr> = options.iter().flatten().map(OsString::as_os_str).collect();
-        let mut stage = Stage::new(what);
+        let mut stage = StageProgress::new(what);
         tool.run(command, &arguments, |printed| {
             if let Some(line) = stage.due(printed) {
-                report(Progress::Line(&line));
+                report(PoseProgress::Line(&line));
             }
         })
     }

@@ -6,12 +6,12 @@ use std::time::{Duration, Instant};
 const INTERVAL: Duration = Duration::from_secs(10);
 
 /// The progress of a running command, as a line every few seconds.
-pub(super) struct Stage<'a> {
+pub(super) struct StageProgress<'a> {
     what: &'a str,
     last: Instant,
 }
 
-impl<'a> Stage<'a> {
+impl<'a> StageProgress<'a> {
     /// Starts a stage; `what` begins its lines.
     pub(super) fn new(what: &'a str) -> Self {
         Self { what, last: Instant::now() }
@@ -76,7 +76,7 @@ mod tests {
         for (printed, expected) in cases {
             assert_eq!(counted(printed), expected, "{printed}");
         }
-        let mut stage = Stage::new("matching");
+        let mut stage = StageProgress::new("matching");
         assert_eq!(stage.due("Matching block [1/1, 1/1]"), None, "too early");
         stage.last = Instant::now().checked_sub(INTERVAL).unwrap();
         assert_eq!(stage.due("Matching block [1/2, 1/2]").unwrap(), "matching: 1 of 4");

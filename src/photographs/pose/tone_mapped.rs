@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::Progress;
+use super::PoseProgress;
 use crate::Result;
 use crate::base::input;
 use crate::base::output::create_folder;
@@ -22,7 +22,7 @@ pub(super) fn write(
     gpu: &Gpu,
     photographs: &mut Vec<PathBuf>,
     folder: &Path,
-    report: &dyn Fn(Progress<'_>),
+    report: &dyn Fn(PoseProgress<'_>),
 ) -> Result<f64> {
     create_folder(folder)?;
     // The same curve for all, so that features keep matching.
@@ -33,9 +33,9 @@ pub(super) fn write(
     let (mut measured, mut undecoded) = (vec![], None);
     photographs.retain(|path| {
         done += 1;
-        report(Progress::Photographs { done, all });
+        report(PoseProgress::Photographs { done, all });
         match Image::load_counted(path, &colours) {
-            Ok(image) => measured.push(MeasuredPhotograph::of(&image.data)),
+            Ok(image) => measured.push(MeasuredPhotograph::measure(&image.data)),
             Err(error) => {
                 tracing::warn!("left out: {error}");
                 undecoded = Some(error);
@@ -47,7 +47,7 @@ pub(super) fn write(
     if let (true, Some(error)) = (photographs.is_empty(), undecoded) {
         return Err(error);
     }
-    colours.say();
+    colours.log();
     let scene = SceneTone::from_photographs(&settings, &measured);
     let targets = Targets::in_scene(gpu, scene.ok_or_else(|| all_black(&root))?)?;
     for (at, (path, measured)) in photographs.iter().zip(&measured).enumerate() {
@@ -59,7 +59,7 @@ pub(super) fn write(
         } else {
             image.save_png8(file)?;
         }
-        report(Progress::Photographs { done: at + 1, all: photographs.len() });
+        report(PoseProgress::Photographs { done: at + 1, all: photographs.len() });
     }
     Ok(targets.scene.exposure.map_or(1.0, |exposure| exposure.gain))
 }

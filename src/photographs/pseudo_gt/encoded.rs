@@ -7,7 +7,7 @@ use crate::gpu::{Buffer, Gpu};
 
 /// A planar (3, H, W) photograph or target on the device, in the fewest bits that restore every value.
 #[derive(Debug)]
-pub struct Encoded {
+pub struct EncodedPlanes {
     /// 8 or 16; 32 if `values` are the values themselves.
     pub code_bits: u32,
     /// 3 H W.
@@ -18,7 +18,7 @@ pub struct Encoded {
     pub values: Arc<Buffer<f32>>,
 }
 
-impl Encoded {
+impl EncodedPlanes {
     /// Uncoded values.
     pub fn plain(gpu: &Gpu, values: Arc<Buffer<f32>>) -> Result<Self> {
         let codes = gpu.uninit("no codes", 0)?;

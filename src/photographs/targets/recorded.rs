@@ -105,7 +105,7 @@ mod tests {
 
     fn photograph(brightness: f32) -> MeasuredPhotograph {
         let values: Vec<f32> = (0..300).map(|i| brightness * (i % 17) as f32 / 17.0).collect();
-        MeasuredPhotograph::of(&values)
+        MeasuredPhotograph::measure(&values)
     }
 
     fn law_of(tone: &ToneSettings) -> SceneTone {
@@ -113,7 +113,7 @@ mod tests {
         let scene = SceneTone::from_photographs(tone, &measured).unwrap();
         let mapping = |(name, one)| (format!("view {name}\""), scene.mapping_of(one));
         let mappings = (0..).zip(&measured).map(mapping).collect();
-        let model_gain = scene.exposure.as_ref().map(|own| own.gain);
+        let model_gain = scene.exposure.as_ref().map(|set_exposure| set_exposure.gain);
         SceneTone { model_gain, mappings, ..scene }
     }
 
@@ -129,12 +129,12 @@ mod tests {
             let named = ToneSettings { law: Some(path.clone()), ..tone };
             let read = SceneTone::recorded(&named).unwrap().unwrap();
             assert_eq!(read.mappings.len(), 3);
-            for (read, own) in read.mappings.values().zip(law.mappings.values()) {
+            for (read, written) in read.mappings.values().zip(law.mappings.values()) {
                 assert_eq!(
                     bytemuck::bytes_of(&read.parameters),
-                    bytemuck::bytes_of(&own.parameters)
+                    bytemuck::bytes_of(&written.parameters)
                 );
-                assert_eq!(read.gain.map(f64::to_bits), own.gain.map(f64::to_bits));
+                assert_eq!(read.gain.map(f64::to_bits), written.gain.map(f64::to_bits));
             }
             assert_eq!(read.exposure.map(|one| one.reason()), law.exposure.map(|one| one.reason()));
             assert_eq!(read.model_gain, law.model_gain);

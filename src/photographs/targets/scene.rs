@@ -61,7 +61,7 @@ impl SceneTone {
     ) -> Option<Self> {
         let exposure = if settings.takes_exposure() {
             let luminances = training.iter().map(|one| &one.luminance);
-            let found = Exposure::of(luminances, settings.brightness)?;
+            let found = Exposure::measure(luminances, settings.brightness)?;
             let seen = training.iter().map(|one| Some((&one.luminance, one.camera?)));
             let found = match seen.collect::<Option<Vec<_>>>() {
                 Some(seen) => found.seen_by(seen),
@@ -86,8 +86,8 @@ impl SceneTone {
         }
         let scene = Self::from_photographs(settings, &training);
         let mut scene = scene.ok_or_else(|| all_black(&dataset.root))?;
-        for (view, own) in views.iter().zip(&training) {
-            scene.mappings.insert(view.name.clone(), scene.mapping_of(own));
+        for (view, measured) in views.iter().zip(&training) {
+            scene.mappings.insert(view.name.clone(), scene.mapping_of(measured));
         }
         scene.model_gain = scene.model_exposure().map(|_| {
             let gains = scene.mappings.values().filter_map(|mapping| mapping.gain.map(f64::ln));
@@ -177,7 +177,7 @@ impl SceneTone {
         if self.is_recorded {
             return self.known(view);
         }
-        let measured = MeasuredPhotograph::of(&view.counted(photograph)).seen_by(&view.camera);
+        let measured = MeasuredPhotograph::measure(&view.counted(photograph)).seen_by(&view.camera);
         Ok(self.mapping_of(&measured))
     }
 
@@ -209,7 +209,7 @@ impl SceneTone {
 
     /// The curve of the whole scene, whose inverse is [`SceneTone::inverse_of_scene`].
     pub fn law(&self) -> Result<SceneLaw> {
-        SceneLaw::of(&self.settings, &self.mapping_of(&self.together).parameters)
+        SceneLaw::new(&self.settings, &self.mapping_of(&self.together).parameters)
     }
 }
 
@@ -232,7 +232,7 @@ fn measured_of(view: &View, full_resolution: bool) -> Result<Option<MeasuredPhot
     let measured = match read_anew.and_then(|original| original.measured(size)) {
         Some(measured) => Some(measured.clone()),
         None => source(view, full_resolution)?
-            .map(|photograph| MeasuredPhotograph::of(&view.counted(&photograph))),
+            .map(|photograph| MeasuredPhotograph::measure(&view.counted(&photograph))),
     };
     Ok(measured.map(|measured| measured.seen_by(&view.camera)))
 }

@@ -45,7 +45,7 @@ pub(crate) fn tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> f32 {
 
 /// The curve at t = x / white, unclamped.
 pub(crate) fn curve_at<T: Real>(curve: u32, t: T, [offset, gain]: [T; 2], c: &Constants<T>) -> T {
-    let one = T::of(1.0);
+    let one = T::from_f64(1.0);
     match curve {
         CURVE_NONE | CURVE_LINEAR => t,
         CURVE_ASE | CURVE_AUTO => offset + (one - offset) * (gain * t).one_minus_exp(),
@@ -53,7 +53,8 @@ pub(crate) fn curve_at<T: Real>(curve: u32, t: T, [offset, gain]: [T; 2], c: &Co
         CURVE_TANH => offset + (one - offset) * (gain * within(t)).tanh(),
         CURVE_ASE_FLOOR => {
             let (t, share, white) = (within(t), c[0], gain.one_minus_exp());
-            let scale = (one - offset) * white / ((one - share) * white + share + T::of(1e-8));
+            let scale =
+                (one - offset) * white / ((one - share) * white + share + T::from_f64(1e-8));
             offset + scale * ((one - share) * (gain * t).one_minus_exp() + share * t)
         }
         _ => offset + gain * curve_shape(curve, within(t), c),
@@ -62,5 +63,5 @@ pub(crate) fn curve_at<T: Real>(curve: u32, t: T, [offset, gain]: [T; 2], c: &Co
 
 /// Clamped to [0, 1]; a NaN becomes black.
 pub(crate) fn clamped<T: Real>(y: T) -> T {
-    if y > T::of(0.0) { y.at_most(T::of(1.0)) } else { T::of(0.0) }
+    if y > T::from_f64(0.0) { y.at_most(T::from_f64(1.0)) } else { T::from_f64(0.0) }
 }

@@ -91,7 +91,7 @@ struct NeighbourGains {
     /// ln gain of each camera.
     gains: Vec<f64>,
     /// s: the weight of a view's own gain.
-    own: f64,
+    own_share: f64,
 }
 
 impl NeighbourGains {
@@ -109,7 +109,7 @@ impl NeighbourGains {
 impl Exposure {
     /// The exposure of a set, from the luminance of its training photographs. `brightness` is the mean luminance of the
     /// targets, instead of the rule's. `None` if every photograph is almost black.
-    pub fn of<'a>(
+    pub fn measure<'a>(
         views: impl IntoIterator<Item = &'a LuminanceHistogram>,
         brightness: Option<f64>,
     ) -> Option<Self> {
@@ -141,7 +141,7 @@ impl Exposure {
         })
     }
 
-    /// [`Exposure::of`] with the cameras of the training photographs.
+    /// [`Exposure::measure`] with the cameras of the training photographs.
     #[must_use]
     pub fn seen_by<'a>(
         self,
@@ -157,18 +157,18 @@ impl Exposure {
         let every = gains.len().div_ceil(MAX_POSES);
         let (poses, at) =
             (CameraPoses::new(&cameras), gains.iter().step_by(every).copied().collect());
-        let mut around = NeighbourGains { poses: poses.every(every), gains: at, own: 0.0 };
+        let mut around = NeighbourGains { poses: poses.every(every), gains: at, own_share: 0.0 };
         let smooth: Vec<f64> = cameras.iter().map(|camera| around.ln_gain(camera)).collect();
-        let squares = gains.iter().zip(&smooth).map(|(own, smooth)| (own - smooth).powi(2));
+        let squares = gains.iter().zip(&smooth).map(|(gain, smooth)| (gain - smooth).powi(2));
         let variance = mean(&squares.collect::<Vec<_>>());
-        around.own = variance / (variance + NOISE * NOISE);
+        around.own_share = variance / (variance + NOISE * NOISE);
         // The slope of ln k over ln gain.
         let middle = mean(&gains);
         let (mut products, mut squares) = (0.0, 0.0);
-        for (own, smooth) in gains.iter().zip(&smooth) {
-            let used = around.own * own + (1.0 - around.own) * smooth;
-            products += (used - middle) * (own - middle);
-            squares += (own - middle).powi(2);
+        for (gain, smooth) in gains.iter().zip(&smooth) {
+            let used = around.own_share * gain + (1.0 - around.own_share) * smooth;
+            products += (used - middle) * (gain - middle);
+            squares += (gain - middle).powi(2);
         }
         let share = if squares > 0.0 { products / squares } else { self.share };
         Self { share: share.clamp(0.0, 1.0), around: Some(around), ..self }
@@ -185,13 +185,13 @@ impl Exposure {
         if is_black(view) {
             return self.gain;
         }
-        let own = gain_of(view, self.brightness).ln();
+        let ln_gain = gain_of(view, self.brightness).ln();
         let (share, other) = match (&self.around, camera) {
-            (Some(around), Some(camera)) => (around.own, around.ln_gain(camera)),
+            (Some(around), Some(camera)) => (around.own_share, around.ln_gain(camera)),
             (Some(_), None) => (share_without_cameras(self.spread.powi(2)), self.gain.ln()),
             (None, _) => (self.share, self.gain.ln()),
         };
-        (share * own + (1.0 - share) * other).exp()
+        (share * ln_gain + (1.0 - share) * other).exp()
     }
 
     /// k of what a camera sees, without a photograph of it: the mean of its neighbours, or the scene's.
@@ -239,7 +239,7 @@ impl Exposure {
 }
 
 /// The values from which values at one gain are interpolated to another, at this weight of the curve; ascending.
-pub fn exposed_anew([from, to]: [f64; 2], weight: f64) -> Vec<[f32; 2]> {
+pub fn exposure_knots([from, to]: [f64; 2], weight: f64) -> Vec<[f32; 2]> {
     const KNOTS: u32 = 1024;
     // Evenly spaced in the output of the curve, up to its white.
     let knot = |i: u32| {

@@ -87,7 +87,7 @@ impl Family {
     /// df/dt, exact; at a knee, the derivative of one side.
     #[cfg(feature = "testing")]
     pub fn derivative(&self, t: f64, constants: &[f64]) -> f64 {
-        let constants = padded(constants).map(Dual::of);
+        let constants = padded(constants).map(Dual::from_f64);
         curve_shape(self.curve as u32, within(Dual::variable(t)), &constants).derivative
     }
 
@@ -95,9 +95,9 @@ impl Family {
     #[cfg(feature = "testing")]
     pub fn gradient(&self, t: f64, constants: &[f64]) -> Vec<f64> {
         let derivative = |index: usize| {
-            let mut constants = padded(constants).map(Dual::of);
+            let mut constants = padded(constants).map(Dual::from_f64);
             constants[index].derivative = 1.0;
-            curve_shape(self.curve as u32, Dual::of(within(t)), &constants).derivative
+            curve_shape(self.curve as u32, Dual::from_f64(within(t)), &constants).derivative
         };
         (0..self.constants.len()).map(derivative).collect()
     }

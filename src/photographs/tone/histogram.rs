@@ -23,7 +23,7 @@ pub struct LuminanceHistogram {
 
 impl LuminanceHistogram {
     /// The histogram of a planar (3, H, W) photograph, sRGB-encoded; NaN and negative values count as 0.
-    pub fn of(planes: &[f32]) -> Self {
+    pub fn new(planes: &[f32]) -> Self {
         let (red, rest) = planes.split_at(planes.len() / 3);
         let (green, blue) = rest.split_at(red.len());
         let mut counts = vec![0_u32; BINS];
@@ -107,14 +107,14 @@ mod tests {
     #[test]
     fn every_luminance_is_binned_within_half_a_percent() {
         for x in [3.1e-5_f32, 1e-4, 0.0039, 0.0041, 0.5, 1.0, 1.5, 30.0, 65504.0] {
-            let histogram = LuminanceHistogram::of(&[x; 3]);
+            let histogram = LuminanceHistogram::new(&[x; 3]);
             assert_eq!(histogram.pixel_count(), 1);
             let found = histogram.quantile(0.5);
             assert!((found / f64::from(x) - 1.0).abs() < 0.004, "{x}: {found}");
             assert_eq!(histogram.mean(), found);
         }
         for black in [0.0, 1e-9, -1.0, f32::NAN] {
-            assert_eq!(LuminanceHistogram::of(&[black; 3]).quantile(1.0), 0.0);
+            assert_eq!(LuminanceHistogram::new(&[black; 3]).quantile(1.0), 0.0);
         }
         assert_eq!(LuminanceHistogram::default().quantile(0.5), 0.0);
         assert_eq!(LuminanceHistogram::default().mean(), 0.0);
@@ -126,10 +126,10 @@ mod tests {
         for plane in 0..3 {
             planes[1000 * plane] = 1.0;
         }
-        let one = LuminanceHistogram::of(&planes);
+        let one = LuminanceHistogram::new(&planes);
         assert!((one.quantile(0.999) - 0.25).abs() < 1e-3);
         assert!((one.quantile(1.0) - 1.0).abs() < 4e-3);
-        let mut both = LuminanceHistogram::of(&[0.0; 3000]);
+        let mut both = LuminanceHistogram::new(&[0.0; 3000]);
         both.add(&one);
         assert_eq!(both.pixel_count(), 2000);
         assert!((both.mean() - 0.5 * one.mean()).abs() < 1e-12);

@@ -83,8 +83,8 @@ impl InverseTone {
         let curved = match *number {
             CURVE_AUTO => {
                 let share = constants[0];
-                let own = (1.0 - share) * t.one_minus_exp() + share * t * factor;
-                offset + (1.0 - offset) * own
+                let toe = (1.0 - share) * t.one_minus_exp() + share * t * factor;
+                offset + (1.0 - offset) * toe
             }
             CURVE_TABLE => self.table.as_ref().map_or(t, |table| table.value(t, channel)),
             // A pixel's gain is that of its luminance, up to 1e-6 of it.
@@ -135,7 +135,7 @@ impl InverseTone {
     }
 
     /// The colour of a photograph whose target is this one.
-    pub fn of(&self, target: [f64; 3]) -> Inverted {
+    pub fn invert(&self, target: [f64; 3]) -> Inverted {
         let is_clipped = (0..3).any(|channel| target[channel] > self.largest[channel]);
         let bounded = self.bounded(target);
         let solved =
@@ -155,8 +155,8 @@ impl InverseTone {
                 break;
             }
             let next = match before {
-                Some([other, known]) if (known - error).abs() > f64::MIN_POSITIVE => {
-                    y + error * (y - other) / (known - error)
+                Some([other, other_error]) if (other_error - error).abs() > f64::MIN_POSITIVE => {
+                    y + error * (y - other) / (other_error - error)
                 }
                 _ => y + error,
             };
@@ -170,7 +170,7 @@ impl InverseTone {
     /// By how many stops linear light has to be raised for the brightness of the target: for a grey that reflects 18 %.
     pub fn stops_to_target(&self) -> f64 {
         const GREY: f32 = 0.18;
-        let grey = self.of([srgb_from_linear(GREY).into(); 3]).rgb[1] as f32;
+        let grey = self.invert([srgb_from_linear(GREY).into(); 3]).rgb[1] as f32;
         f64::from(GREY / linear_from_srgb(grey)).log2()
     }
 
@@ -200,7 +200,7 @@ mod tests {
 
     fn inverse(settings: &ToneSettings) -> InverseTone {
         let dark: Vec<f32> = (0..3000).map(|i| 0.2 * (i as f32 / 3000.0).powi(2)).collect();
-        let photograph = MeasuredPhotograph::of(&dark);
+        let photograph = MeasuredPhotograph::measure(&dark);
         SceneTone::from_photographs(settings, &[photograph]).unwrap().inverse_of_scene().unwrap()
     }
 
@@ -214,14 +214,14 @@ mod tests {
             let mut restored = 0;
             for rgb in colours() {
                 let target = inverse.target(rgb);
-                let Inverted { rgb: back, is_clipped } = inverse.of(target);
+                let Inverted { rgb: back, is_clipped } = inverse.invert(target);
                 if is_clipped {
                     continue;
                 }
                 restored += 1;
-                for (own, back) in rgb.into_iter().zip(back) {
-                    let stops = (linear(back) / linear(own)).log2().abs();
-                    assert!(stops < 1e-3, "{curve}: {own} becomes {back}, {stops} stops");
+                for (value, back) in rgb.into_iter().zip(back) {
+                    let stops = (linear(back) / linear(value)).log2().abs();
+                    assert!(stops < 1e-3, "{curve}: {value} becomes {back}, {stops} stops");
                 }
             }
             assert!(restored > 3, "{curve}: {restored}");
@@ -232,10 +232,10 @@ mod tests {
     fn values_in_the_flat_part_are_counted_and_stay_finite() {
         let inverse = inverse(&ToneSettings::new(Tone::Auto));
         for flat in [[1.0; 3], [2.0, 0.3, 0.3], [0.9999, 0.1, 0.1]] {
-            let Inverted { rgb, is_clipped } = inverse.of(flat);
+            let Inverted { rgb, is_clipped } = inverse.invert(flat);
             assert!(is_clipped && rgb.iter().all(|x| x.is_finite()), "{rgb:?}");
         }
-        let dark = inverse.of([f64::NAN, -1.0, 0.0]);
+        let dark = inverse.invert([f64::NAN, -1.0, 0.0]);
         assert_eq!(dark, Inverted { rgb: [0.0; 3], is_clipped: false });
     }
 

@@ -42,8 +42,8 @@ pub struct MeasuredPhotograph {
 
 impl MeasuredPhotograph {
     /// Measures the planes (3, pixels) of a photograph.
-    pub fn of(planes: &[f32]) -> Self {
-        let (statistics, luminance) = (Statistics::of(planes), LuminanceHistogram::of(planes));
+    pub fn measure(planes: &[f32]) -> Self {
+        let (statistics, luminance) = (Statistics::new(planes), LuminanceHistogram::new(planes));
         Self { statistics, luminance, camera: None }
     }
 
@@ -70,12 +70,13 @@ impl ToneSettings {
         statistics: &Statistics,
         number: impl Fn(Variable, f64) -> T,
     ) -> Curve<T> {
-        let [zero, one, epsilon] = [0.0, 1.0, EPSILON].map(T::of);
-        let measured = |x: f32| T::of(x.into());
+        let [zero, one, epsilon] = [0.0, 1.0, EPSILON].map(T::from_f64);
+        let measured = |x: f32| T::from_f64(x.into());
         let mean_luminance = measured(statistics.mean_luminance);
         let theta = number(Variable::Theta, self.theta);
-        let bounded_gain =
-            |value: T| (theta / value).at_least(T::of(GAINS[0])).at_most(T::of(GAINS[1]));
+        let bounded_gain = |value: T| {
+            (theta / value).at_least(T::from_f64(GAINS[0])).at_most(T::from_f64(GAINS[1]))
+        };
         let given = padded(&self.constants);
         let mut constants: Constants<T> =
             std::array::from_fn(|index| number(Variable::Constant(index), given[index]));
@@ -83,7 +84,7 @@ impl ToneSettings {
             White::One => [one, zero, one],
             White::Mean => {
                 let white = measured(statistics.mean) / theta;
-                [white.at_least(T::of(MIN_WHITE)), zero, one]
+                [white.at_least(T::from_f64(MIN_WHITE)), zero, one]
             }
             White::MeanLuminance => [one, zero, bounded_gain(mean_luminance + epsilon)],
             White::ChannelMeans => {
@@ -206,5 +207,5 @@ impl ToneSettings {
 
 /// delta0 = alpha (1 - r)^beta of a photograph with r = p10 / p90; with beta 0 it is alpha for every photograph.
 fn black_level<T: Real>(alpha: T, beta: f64, ratio: f64) -> T {
-    alpha * T::of((1.0 - ratio).powf(beta))
+    alpha * T::from_f64((1.0 - ratio).powf(beta))
 }

@@ -115,17 +115,16 @@ impl Profile {
 
 /// The colour of t = k x under a profile, in [0, 1]; `profile` is (3, `PROFILE_WIDTH`).
 pub(crate) fn profiled<T: Real>(t: [T; 3], profile: &[T]) -> [T; 3] {
-    let [zero, one] = [0.0, 1.0].map(T::of);
+    let [zero, one] = [0.0, 1.0].map(T::from_f64);
     let unit = |x: T| x.at_least(zero).at_most(one);
     let v = t.map(T::one_minus_exp);
     [0, 1, 2].map(|channel| {
-        let own = &profile[channel * PROFILE_WIDTH as usize..][..PROFILE_WIDTH as usize];
-        let u = own[0] * v[0] + own[1] * v[1] + own[2] * v[2] + own[3];
-        let place = T::of(SEGMENTS.into()) * unit(u);
-        let y = own[5..]
-            .iter()
-            .zip(0..SEGMENTS)
-            .fold(own[4], |y, (&rise, segment)| y + rise * unit(place - T::of(segment.into())));
+        let numbers = &profile[channel * PROFILE_WIDTH as usize..][..PROFILE_WIDTH as usize];
+        let u = numbers[0] * v[0] + numbers[1] * v[1] + numbers[2] * v[2] + numbers[3];
+        let scaled = T::from_f64(SEGMENTS.into()) * unit(u);
+        let y = numbers[5..].iter().zip(0..SEGMENTS).fold(numbers[4], |y, (&rise, segment)| {
+            y + rise * unit(scaled - T::from_f64(segment.into()))
+        });
         unit(y)
     })
 }

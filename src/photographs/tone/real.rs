@@ -16,7 +16,7 @@ pub trait Real:
     + Neg<Output = Self>
 {
     /// The number nearest to `x`; its derivative is 0.
-    fn of(x: f64) -> Self;
+    fn from_f64(x: f64) -> Self;
     /// e^x.
     fn exp(self) -> Self;
     /// 1 - e^-x without cancellation.
@@ -32,8 +32,8 @@ pub trait Real:
 
     /// The hyperbolic tangent, for x >= 0.
     fn tanh(self) -> Self {
-        let q = (Self::of(2.0) * self).one_minus_exp();
-        q / (Self::of(2.0) - q)
+        let q = (Self::from_f64(2.0) * self).one_minus_exp();
+        q / (Self::from_f64(2.0) - q)
     }
 
     /// The greater of both.
@@ -69,7 +69,7 @@ macro_rules! standard_functions {
 }
 
 impl Real for f32 {
-    fn of(x: f64) -> Self {
+    fn from_f64(x: f64) -> Self {
         x as Self
     }
     /// As in the shader.
@@ -84,7 +84,7 @@ impl Real for f32 {
 }
 
 impl Real for f64 {
-    fn of(x: f64) -> Self {
+    fn from_f64(x: f64) -> Self {
         x
     }
     fn one_minus_exp(self) -> Self {
@@ -165,7 +165,7 @@ impl Neg for Dual {
 }
 
 impl Real for Dual {
-    fn of(value: f64) -> Self {
+    fn from_f64(value: f64) -> Self {
         Self { value, derivative: 0.0 }
     }
     fn exp(self) -> Self {
@@ -183,7 +183,7 @@ impl Real for Dual {
             let relative = p.value * self.derivative / self.value + self.value.ln() * p.derivative;
             Self { value, derivative: value * relative }
         } else {
-            Self::of(0.0)
+            Self::from_f64(0.0)
         }
     }
     fn sqrt(self) -> Self {
@@ -197,7 +197,7 @@ impl Real for Dual {
 
 /// Clamps to (0, [`LARGEST_T`]); a NaN counts as black.
 pub(crate) fn within<T: Real>(t: T) -> T {
-    if t > T::of(0.0) { t.at_most(T::of(LARGEST_T)) } else { T::of(0.0) }
+    if t > T::from_f64(0.0) { t.at_most(T::from_f64(LARGEST_T)) } else { T::from_f64(0.0) }
 }
 
 #[cfg(test)]

@@ -23,7 +23,7 @@ impl SceneLaw {
     /// The law of a scene with these parameters.
     #[cfg(feature = "io")]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn of(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {
+    pub(crate) fn new(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {
         let stops = InverseTone::new(settings, parameters)?.stops_to_target() as f32;
         if matches!(settings.curve, Tone::Table(_)) {
             let problem =
@@ -136,7 +136,7 @@ mod tests {
         let settings = ToneSettings::new(Tone::Table(table));
         let parameters =
             ToneParameters { white: 1.0, gain: 1.0, weight: 1.0, ..Default::default() };
-        let refused = SceneLaw::of(&settings, &parameters).unwrap_err().to_string();
+        let refused = SceneLaw::new(&settings, &parameters).unwrap_err().to_string();
         assert!(
             refused.contains("a table of values") && refused.contains("named curve"),
             "{refused}"

@@ -24,7 +24,7 @@ pub struct Statistics {
 
 impl Statistics {
     /// The statistics of a planar (3, H, W) photograph; without pixels, those of a black one.
-    pub fn of(planes: &[f32]) -> Self {
+    pub fn new(planes: &[f32]) -> Self {
         let (red, rest) = planes.split_at(planes.len() / 3);
         let (green, blue) = rest.split_at(red.len());
         let mut luminances = Vec::with_capacity(red.len());

@@ -25,7 +25,7 @@ impl Table {
     /// acts on stored values. Blank lines and lines that begin with `#` are ignored.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn from_csv(text: &str) -> Result<Self, String> {
-        let mut rows = Rows::default();
+        let mut rows = TableRows::default();
         let mut is_of_stored = false;
         for (line, text) in content(text) {
             let cells: Vec<&str> = text.split([',', ';', '\t']).map(str::trim).collect();
@@ -49,7 +49,7 @@ impl Table {
     /// Reads a one-dimensional .cube file; it acts on stored values.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn from_cube(text: &str) -> Result<Self, String> {
-        let mut rows = Rows::default();
+        let mut rows = TableRows::default();
         let (mut size, mut low, mut high) = (0, 0.0, 1.0);
         for (line, text) in content(text) {
             let cells: Vec<&str> = text.split_whitespace().collect();
@@ -143,7 +143,7 @@ pub(crate) fn interpolate<T: Real>(knots: &[[T; 3]], x: T) -> T {
     let s = (x - x0) / width;
     let rise = y1 - y0;
     let (a, b) = (width * d0 - rise, rise - width * d1);
-    let left = T::of(1.0) - s;
+    let left = T::from_f64(1.0) - s;
     y0 + rise * s + s * left * (a * left + b * s)
 }
 
@@ -154,12 +154,12 @@ fn content(text: &str) -> impl Iterator<Item = (usize, &str)> {
 }
 
 #[derive(Default)]
-struct Rows {
+struct TableRows {
     x: Vec<f64>,
     y: Vec<Vec<f64>>,
 }
 
-impl Rows {
+impl TableRows {
     /// Reads a line of numbers; the first is the input unless `x` is given.
     fn push(&mut self, line: usize, cells: &[&str], x: Option<f64>) -> Result<(), String> {
         let number = |cell: &&str| {

@@ -69,7 +69,7 @@ impl Fisheye {
         }
     }
 
-    pub(super) fn place(&self, point: DVec3) -> ImagePoint {
+    pub(super) fn image_point(&self, point: DVec3) -> ImagePoint {
         let Ray { distance, across: n, sine, cosine, radius, slope, stretch, .. } = self.ray(point);
         let row = |axis: DVec2| {
             let along = axis.dot(n);

@@ -20,7 +20,7 @@ impl Pinhole {
         slope.max(self.min_slope).min(self.max_slope)
     }
 
-    pub(super) fn place(&self, point: DVec3) -> ImagePoint {
+    pub(super) fn image_point(&self, point: DVec3) -> ImagePoint {
         let slope = self.clamped_slope(point);
         let rows = [DVec3::new(1.0, 0.0, -slope.x), DVec3::new(0.0, 1.0, -slope.y)];
         ImagePoint { at: point.truncate() / point.z, jacobian: rows.map(|row| row / point.z) }

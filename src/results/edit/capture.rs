@@ -18,12 +18,12 @@ use crate::results::finished_run::{FinishedRun, Opener, is_model};
 use crate::results::run;
 use crate::splats::model::Model;
 use crate::splats::render::RenderSettings;
-use crate::splats::scene::{Facts, Gaussians};
+use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
 /// The photographs of a model.
-pub(super) struct Capture {
+pub(super) struct ModelPhotographs {
     pub(super) gpu: Gpu,
     pub(super) config: TrainConfig,
     pub(super) dataset: Dataset,
@@ -36,7 +36,7 @@ pub(super) struct Capture {
 /// A larger mean relative error of a distance between two cameras is warned of.
 const LARGE_ERROR: f64 = 0.05;
 
-impl Capture {
+impl ModelPhotographs {
     pub(super) fn open(model: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
         let FinishedRun { gpu, config, dataset, .. } = FinishedRun::open(model, dataset, opener)?;
         let (is_model, learns) = (is_model(model), config.exposure.learn);
@@ -49,14 +49,14 @@ impl Capture {
         self.dataset.views.iter().filter(|view| view.is_for_training())
     }
 
-    /// The targets of [`Capture::views`]; `None` without a photograph.
+    /// The targets of [`ModelPhotographs::views`]; `None` without a photograph.
     pub(super) fn targets(&self) -> Result<Vec<Option<Image>>> {
         let targets = Targets::new(&self.gpu, &self.tone, &self.dataset)?;
         self.views().map(|view| targets.target(view)).collect()
     }
 
     /// The near plane of a model in the edited world, in its units.
-    pub(super) fn near(&self, facts: &Facts, placement: &Placement) -> f64 {
+    pub(super) fn near(&self, facts: &ModelFacts, placement: &Placement) -> f64 {
         let frame = placement.frame(&self.config.frame.unwrap_or_default());
         let near = facts.near.or(self.config.facts(&frame).near);
         near.unwrap_or(RenderSettings::default().near).into()
@@ -64,7 +64,7 @@ impl Capture {
 
     /// What the test views are scored against.
     pub(super) fn score_reference(&self) -> Result<ScoreReference> {
-        ScoreReference::of(&self.gpu, &self.config.tone, &self.dataset)
+        ScoreReference::new(&self.gpu, &self.config.tone, &self.dataset)
     }
 
     /// The mean PSNR of a model on the test views, dB, with the networks of its run, if it is one; `None` without test
@@ -73,14 +73,14 @@ impl Capture {
         &self,
         run: Option<&Path>,
         gaussians: &Gaussians,
-        facts: &Facts,
+        facts: &ModelFacts,
         placement: &Placement,
         score_reference: &mut ScoreReference,
     ) -> Result<Option<f64>> {
         let Self { gpu, config, dataset, .. } = self;
         let frame = placement.frame(&config.frame.unwrap_or_default());
         let near = facts.near.or(config.facts(&frame).near);
-        let model = Model::of_shown(gaussians.clone(), &Facts { near, ..*facts });
+        let model = Model::of_shown(gaussians.clone(), &ModelFacts { near, ..*facts });
         let config = TrainConfig { frame: Some(frame), ..config.clone() };
         let features = gaussians.shape.features;
         let networks = match run {
@@ -110,9 +110,9 @@ impl Capture {
         let pair = |view: &View| Some((view.camera.center(), *positions.get(&view.name)?));
         let pairs: Vec<(DVec3, DVec3)> = self.dataset.views.iter().filter_map(pair).collect();
         let (mut own_squares, mut products, mut squares) = (0.0, 0.0, 0.0);
-        for (index, (own, metres)) in pairs.iter().enumerate() {
-            for (other_own, other_metres) in &pairs[index + 1..] {
-                let [a, b] = [own.distance(*other_own), metres.distance(*other_metres)];
+        for (index, (position, metres)) in pairs.iter().enumerate() {
+            for (other_position, other_metres) in &pairs[index + 1..] {
+                let [a, b] = [position.distance(*other_position), metres.distance(*other_metres)];
                 (own_squares, products, squares) =
                     (own_squares + a * a, products + a * b, squares + b * b);
             }

@@ -4,25 +4,25 @@
 use std::borrow::Cow;
 use std::path::Path;
 
-use super::operation::Fingerprint;
+use super::operation::ModelChecksum;
 use super::step::Step;
 use crate::Result;
 use crate::results::export::Provenance;
 use crate::results::models;
 use crate::splats::scene::ply::parts::{PART, PartFile, save_parts};
-use crate::splats::scene::{Facts, Gaussians, Lengths};
+use crate::splats::scene::{Gaussians, Lengths, ModelFacts};
 
 /// The Gaussians of a model after some steps.
 #[derive(Debug)]
 pub(super) struct Content {
-    source: Source,
+    source: ContentSource,
     count: usize,
     /// None of the Gaussians, with their shape and origin.
     none: Gaussians,
 }
 
 #[derive(Debug)]
-enum Source {
+enum ContentSource {
     Whole(Gaussians),
     /// The steps apply to each part when it is read.
     Parts(PartFile, Vec<Step>),
@@ -30,7 +30,7 @@ enum Source {
 
 impl Content {
     /// Opens a run or a model file.
-    pub(super) fn open(path: &Path) -> Result<(Self, Facts)> {
+    pub(super) fn open(path: &Path) -> Result<(Self, ModelFacts)> {
         if let Some((file, facts)) = models::open_parts(path, PART)? {
             return Ok((Self::of_parts(file), facts));
         }
@@ -41,13 +41,13 @@ impl Content {
     fn of_parts(file: PartFile) -> Self {
         let mut none = Gaussians::zeros(0, file.shape());
         none.origin = file.facts().origin;
-        Self { count: file.count(), none, source: Source::Parts(file, vec![]) }
+        Self { count: file.count(), none, source: ContentSource::Parts(file, vec![]) }
     }
 
     pub(super) fn of_whole(gaussians: Gaussians) -> Self {
         let mut none = Gaussians::zeros(0, gaussians.shape);
         none.origin = gaussians.origin;
-        Self { count: gaussians.count, none, source: Source::Whole(gaussians) }
+        Self { count: gaussians.count, none, source: ContentSource::Whole(gaussians) }
     }
 
     pub(super) fn count(&self) -> usize {
@@ -61,7 +61,7 @@ impl Content {
 
     /// The checksum of a model by which an edit list names it.
     pub(super) fn fingerprint(&self) -> Result<String> {
-        let mut fingerprint = Fingerprint::new(self.count, self.none.shape, self.none.origin);
+        let mut fingerprint = ModelChecksum::new(self.count, self.none.shape, self.none.origin);
         self.each_part(|part| {
             fingerprint.add(part);
             Ok(())
@@ -84,11 +84,11 @@ impl Content {
         let removes = step.removes();
         step.apply(0, &mut self.none);
         match &mut self.source {
-            Source::Whole(gaussians) => {
+            ContentSource::Whole(gaussians) => {
                 step.apply(0, gaussians);
                 self.count = gaussians.count;
             }
-            Source::Parts(_, steps) => {
+            ContentSource::Parts(_, steps) => {
                 steps.push(step);
                 if removes {
                     let mut count = 0;
@@ -105,7 +105,7 @@ impl Content {
 
     /// All Gaussians, in memory.
     pub(super) fn whole(&self) -> Result<Cow<'_, Gaussians>> {
-        if let Source::Whole(gaussians) = &self.source {
+        if let ContentSource::Whole(gaussians) = &self.source {
             return Ok(Cow::Borrowed(gaussians));
         }
         let mut whole = Gaussians::zeros(self.count, self.none.shape);
@@ -132,8 +132,8 @@ impl Content {
 
     fn each_part(&self, mut take: impl FnMut(&Gaussians) -> Result<()>) -> Result<()> {
         match &self.source {
-            Source::Whole(gaussians) => take(gaussians),
-            Source::Parts(file, steps) => {
+            ContentSource::Whole(gaussians) => take(gaussians),
+            ContentSource::Parts(file, steps) => {
                 let mut firsts = vec![0; steps.len()];
                 file.read(|mut part| {
                     for (step, first) in steps.iter().zip(&mut firsts) {

@@ -13,7 +13,7 @@
 
 use glam::Vec3;
 
-use super::capture::Capture;
+use super::capture::ModelPhotographs;
 use super::placement::Placement;
 use crate::Result;
 use crate::base::random::Stream;
@@ -24,7 +24,7 @@ use crate::photographs::image::Image;
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer, ViewGradients};
 use crate::splats::scene::{
-    Attribute, COLOR_CHANNELS, DeviceGaussians, Facts, Features, Gaussians, SH_C0,
+    Attribute, COLOR_CHANNELS, DeviceGaussians, Features, Gaussians, ModelFacts, SH_C0,
 };
 
 /// Images of signs per view.
@@ -43,18 +43,18 @@ pub(super) struct Evidence {
 
 /// A model on the device in the frame of its dataset.
 pub(super) struct Measured<'a> {
-    capture: &'a Capture,
+    capture: &'a ModelPhotographs,
     placement: Placement,
     gaussians: Gaussians,
-    facts: Facts,
+    facts: ModelFacts,
 }
 
 impl<'a> Measured<'a> {
     pub(super) fn new(
-        capture: &'a Capture,
+        capture: &'a ModelPhotographs,
         placement: Placement,
         gaussians: &Gaussians,
-        facts: &Facts,
+        facts: &ModelFacts,
     ) -> Self {
         // Networks act on renders; what a Gaussian adds is measured before them.
         let gaussians = gaussians.with_features(Features::NONE);
@@ -62,10 +62,10 @@ impl<'a> Measured<'a> {
     }
 
     fn renderer(&self, gaussians: Gaussians) -> Result<(DeviceGaussians, Renderer)> {
-        let Capture { gpu, config, .. } = self.capture;
+        let ModelPhotographs { gpu, config, .. } = self.capture;
         let frame = self.placement.frame(&config.frame.unwrap_or_default());
         let near = self.facts.near.or(config.facts(&frame).near);
-        let model = Model::of_shown(gaussians, &Facts { near, ..self.facts });
+        let model = Model::of_shown(gaussians, &ModelFacts { near, ..self.facts });
         let settings = RenderSettings {
             patch_pixels: config.patch_pixels,
             near: (f64::from(model.near) * frame.scale) as f32,
@@ -99,16 +99,20 @@ impl<'a> Measured<'a> {
                     let mut d_render = vec![0.0; COLOR_CHANNELS * patch.pixel_count()];
                     match &mask {
                         Some(mask) => {
-                            let own = patch.cut(&mask.weights);
-                            d_render[..own.len()].copy_from_slice(&own);
+                            let mask_weights = patch.cut(&mask.weights);
+                            d_render[..mask_weights.len()].copy_from_slice(&mask_weights);
                         }
                         None => d_render[..patch.pixel_count()].fill(1.0),
                     }
                     vec![d_render]
                 },
                 |_, dc| {
-                    let own = dc.chunks_exact(3).map(|dc| f64::from(dc[0] / SH_C0));
-                    weights.iter_mut().zip(own).for_each(|(sum, own)| *sum += own);
+                    let weights_of_gaussians =
+                        dc.chunks_exact(3).map(|dc| f64::from(dc[0] / SH_C0));
+                    weights
+                        .iter_mut()
+                        .zip(weights_of_gaussians)
+                        .for_each(|(sum, weights_of_gaussians)| *sum += weights_of_gaussians);
                 },
             )?;
             take(&weights);
@@ -146,13 +150,13 @@ impl<'a> Measured<'a> {
                     d_renders
                 },
                 |index, raw| {
-                    for ((own, scale), (product, square)) in
+                    for ((derivative, scale), (product, square)) in
                         raw.iter().zip(&scales).zip(product.iter_mut().zip(&mut square))
                     {
-                        let own = f64::from(*own) * scale;
+                        let derivative = f64::from(*derivative) * scale;
                         match index {
-                            0 => *product += own,
-                            _ => *square += own * own / PROBES as f64,
+                            0 => *product += derivative,
+                            _ => *square += derivative * derivative / PROBES as f64,
                         }
                     }
                 },
@@ -184,23 +188,24 @@ fn d_renders(
     let mask = view.mask.as_ref().map(|mask| mask.resized(view.camera.width, view.camera.height));
     let mask = mask.as_ref().map(|mask| patch.cut(&mask.weights));
     let counts = |at: usize| mask.as_ref().map_or(1.0, |mask| mask[at % pixels]);
-    let own = &planes[..COLOR_CHANNELS * pixels];
+    let colors = &planes[..COLOR_CHANNELS * pixels];
     let image =
         |data: &[f32]| Image { width: patch.size.x, height: patch.size.y, data: data.to_vec() };
     let mut target = image(&patch.cut(&target.data));
     if adjusts {
         // Floaters are errors of the render, which do not change the expected gain.
-        let affine = Affine::least_squares(&target, &image(own)).unwrap_or(Affine::IDENTITY);
+        let affine = Affine::least_squares(&target, &image(colors)).unwrap_or(Affine::IDENTITY);
         target = affine.applied(&target);
     }
-    let residual = own.iter().zip(&target.data).enumerate();
-    let residual = residual.map(|(at, (own, target))| 2.0 * (own - target) * counts(at)).collect();
+    let residual = colors.iter().zip(&target.data).enumerate();
+    let residual =
+        residual.map(|(at, (value, target))| 2.0 * (value - target) * counts(at)).collect();
     let probe = |probe: usize| {
         let sign = |at: usize| {
-            let draw = (probe * own.len() + at) as u64;
+            let draw = (probe * colors.len() + at) as u64;
             if signs.uniform(draw) < 0.5 { -counts(at) } else { counts(at) }
         };
-        (0..own.len()).map(sign).collect()
+        (0..colors.len()).map(sign).collect()
     };
     std::iter::once(residual).chain((0..PROBES).map(probe)).collect()
 }

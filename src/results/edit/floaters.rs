@@ -155,7 +155,7 @@ fn settled(shares: &[f64], evidence_of: impl Fn(&[f64]) -> Result<Evidence>) -> 
                 verdict => *verdict,
             })
             .collect();
-        let count = |verdict: Verdict| next.iter().filter(|own| **own == verdict).count();
+        let count = |verdict: Verdict| next.iter().filter(|found| **found == verdict).count();
         let [candidates, floaters] = [Verdict::Candidate, Verdict::Floater].map(count);
         let error = evidence.error;
         tracing::debug!("round {round}: {candidates} open, {floaters} floaters, error {error:.6}");

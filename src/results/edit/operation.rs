@@ -259,9 +259,9 @@ fn json(value: &impl Serialize) -> String {
 
 /// The checksum of a model by which an edit list names it: of the shape and every number as the file has them,
 /// whatever its header says. Gaussians are added in order, in any parts.
-pub(super) struct Fingerprint(hash::Hasher);
+pub(super) struct ModelChecksum(hash::Hasher);
 
-impl Fingerprint {
+impl ModelChecksum {
     pub(super) fn new(count: usize, shape: Shape, origin: DVec3) -> Self {
         let mut hasher = hash::Hasher::default();
         hasher.write(format!("{count} {shape}").as_bytes());
@@ -284,9 +284,9 @@ impl Fingerprint {
     }
 }
 
-/// The [`Fingerprint`] of a model.
+/// The [`ModelChecksum`] of a model.
 pub(crate) fn fingerprint(gaussians: &Gaussians) -> String {
-    let mut fingerprint = Fingerprint::new(gaussians.count, gaussians.shape, gaussians.origin);
+    let mut fingerprint = ModelChecksum::new(gaussians.count, gaussians.shape, gaussians.origin);
     fingerprint.add(gaussians);
     fingerprint.text()
 }
@@ -329,7 +329,7 @@ mod tests {
         let file = folder.path().join("other.ply");
         let read = EditList::load(&path).unwrap();
         assert!(
-            matches!(read.edits.last(), Some(Operation::Merge { file: own, .. }) if *own == file)
+            matches!(read.edits.last(), Some(Operation::Merge { file: merged, .. }) if *merged == file)
         );
     }
 

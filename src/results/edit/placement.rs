@@ -78,10 +78,10 @@ mod tests {
         placement.rotate(DQuat::from_rotation_x(1.0));
         let moved = placement.camera(&camera);
         for point in [DVec3::new(0.1, 0.2, 0.3), DVec3::new(-1.0, 0.5, 0.0)] {
-            let [own, other] =
+            let [before, other] =
                 [camera.project(point), moved.project(placement.point(point))].map(Option::unwrap);
-            assert!(own.distance(other) < 1e-9, "{own} {other}");
-            assert!(own != DVec2::ZERO);
+            assert!(before.distance(other) < 1e-9, "{before} {other}");
+            assert!(before != DVec2::ZERO);
             let [near, far] = [camera.depth(point), moved.depth(placement.point(point))];
             assert!((near.unwrap() * 0.25 - far.unwrap()).abs() < 1e-12);
         }

@@ -3,10 +3,10 @@
 use serde_json::{Map, Value, json};
 
 use super::ReferenceKind;
-use crate::networks::lpips::Measure;
+use crate::networks::lpips::LpipsVersion;
 use crate::photographs::metrics::Scores;
 use crate::photographs::tone::ToneSettings;
-use crate::results::report::{Best, Column, Table};
+use crate::results::report::{Best, Column, NumberTable};
 
 /// What a score measures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -120,7 +120,7 @@ pub struct Evaluation {
     /// A row for each view, metric and step, the views in the order of the dataset.
     pub scores: Vec<Score>,
     /// The version of LPIPS.
-    pub(crate) lpips: Option<Measure>,
+    pub(crate) lpips: Option<LpipsVersion>,
     /// The steps whose part of `metrics.json` is written even if no view has it.
     pub(super) requested: Vec<After>,
 }
@@ -207,7 +207,7 @@ impl Evaluation {
     pub(crate) fn add_lpips(&self, metrics: &mut Value) {
         let Some(measure) = self.lpips else { return };
         let key = measure.key();
-        let Measure { network, range } = measure;
+        let LpipsVersion { network, range } = measure;
         metrics["lpips"] = json!({ "network": network.name(), "range": range.name(), "key": key });
         let value = |view| self.value(view, Metric::Lpips, After::Model);
         if let Some(mean) = value(None) {
@@ -253,8 +253,8 @@ impl Evaluation {
     }
 
     /// The scores of each view, and their means.
-    pub(crate) fn table(&self) -> Table {
-        let lpips = self.lpips.map(Measure::title).unwrap_or_default();
+    pub(crate) fn table(&self) -> NumberTable {
+        let lpips = self.lpips.map(LpipsVersion::title).unwrap_or_default();
         let all = [
             ("PSNR", 2, Metric::Psnr, After::Model),
             ("channel mean", 2, Metric::PsnrChannelMean, After::Model),
@@ -283,7 +283,7 @@ impl Evaluation {
             (view.unwrap_or("mean").to_owned(), values.collect())
         };
         let mean = (!self.scores.is_empty()).then_some(None);
-        Table {
+        NumberTable {
             title: "Test views".to_owned(),
             label: "view".to_owned(),
             columns: shown.iter().map(column).collect(),
@@ -299,15 +299,15 @@ pub(crate) const AGAINST: &str = "against";
 pub(crate) const WITH_REFERENCE: &str = "with_reference";
 
 /// The note next to scores whose targets depend on reference images.
-pub(crate) fn with_reference(known: &str) -> String {
+pub(crate) fn with_reference(settings: &str) -> String {
     format!(
-        "with reference: the targets depend on {known}; not comparable with scores without reference"
+        "with reference: the targets depend on {settings}; not comparable with scores without reference"
     )
 }
 
 /// Adds [`WITH_REFERENCE`] to `metrics.json` if the targets depend on reference images.
 pub(crate) fn add_reference(metrics: &mut Value, tone: &ToneSettings) {
-    if let Some(known) = tone.knows_references() {
-        metrics[WITH_REFERENCE] = json!(known);
+    if let Some(settings) = tone.knows_references() {
+        metrics[WITH_REFERENCE] = json!(settings);
     }
 }

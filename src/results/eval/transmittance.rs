@@ -27,7 +27,7 @@ impl ResidualTransmittance {
     /// Residual transmittance of a render over the pixels that the view's mask keeps; `None` without any, or if the
     /// image is not a render.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn of(rendered: &Rendered, view: &View) -> Option<Self> {
+    pub(crate) fn measure(rendered: &Rendered, view: &View) -> Option<Self> {
         let mut counted = rendered.transmittances.clone()?;
         if let Some(mask) = &view.mask {
             let mask = mask.resized(rendered.colors.width, rendered.colors.height);
@@ -88,7 +88,7 @@ pub(crate) fn warn_of_holes(
     if means.is_empty() {
         let views: Vec<&View> = dataset.views.iter().filter(|v| v.is_for_training()).collect();
         for view in views.iter().step_by(views.len().div_ceil(MOST).max(1)) {
-            let found = ResidualTransmittance::of(&render(view)?, view);
+            let found = ResidualTransmittance::measure(&render(view)?, view);
             means.extend(found.map(|found| (view.name.as_str(), found.mean)));
         }
     }

@@ -14,7 +14,7 @@ const FLOAT: u32 = 5126;
 const EXTENSION: &str = "KHR_gaussian_splatting";
 
 /// One attribute: name, type and values.
-struct Plane {
+struct GlbAttribute {
     name: String,
     kind: &'static str,
     values: Vec<f32>,
@@ -45,9 +45,12 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
     Ok(file)
 }
 
-fn planes(gaussians: &Gaussians, are_linear: bool) -> Vec<Plane> {
-    let plane =
-        |name: &str, kind, values| Plane { name: format!("{EXTENSION}:{name}"), kind, values };
+fn planes(gaussians: &Gaussians, are_linear: bool) -> Vec<GlbAttribute> {
+    let plane = |name: &str, kind, values| GlbAttribute {
+        name: format!("{EXTENSION}:{name}"),
+        kind,
+        values,
+    };
     let floats = |vectors: &[glam::Vec3]| bytemuck::cast_slice::<_, f32>(vectors).to_vec();
     let opacity: Vec<f32> = gaussians.raw_opacities().iter().map(|&raw| sigmoid(raw)).collect();
     let rotation =
@@ -59,8 +62,8 @@ fn planes(gaussians: &Gaussians, are_linear: bool) -> Vec<Plane> {
     let colors = colors.flat_map(|(dc, &opacity)| [seen(dc.x), seen(dc.y), seen(dc.z), opacity]);
 
     let mut planes = vec![
-        Plane { name: "POSITION".into(), kind: "VEC3", values: floats(gaussians.means()) },
-        Plane { name: "COLOR_0".into(), kind: "VEC4", values: colors.collect() },
+        GlbAttribute { name: "POSITION".into(), kind: "VEC3", values: floats(gaussians.means()) },
+        GlbAttribute { name: "COLOR_0".into(), kind: "VEC4", values: colors.collect() },
         plane("ROTATION", "VEC4", rotation.collect()),
         plane("SCALE", "VEC3", floats(gaussians.log_scales()).into_iter().map(f32::exp).collect()),
         plane("OPACITY", "SCALAR", opacity),
@@ -81,10 +84,10 @@ fn planes(gaussians: &Gaussians, are_linear: bool) -> Vec<Plane> {
     planes
 }
 
-fn description(gaussians: &Gaussians, planes: &[Plane], provenance: &Provenance) -> Value {
+fn description(gaussians: &Gaussians, planes: &[GlbAttribute], provenance: &Provenance) -> Value {
     let mut offset = 0;
     let (mut views, mut accessors, mut attributes) = (vec![], vec![], Map::new());
-    for (index, Plane { name, kind, values }) in planes.iter().enumerate() {
+    for (index, GlbAttribute { name, kind, values }) in planes.iter().enumerate() {
         let bytes = 4 * values.len();
         views.push(json!({ "buffer": 0, "byteOffset": offset, "byteLength": bytes }));
         accessors.push(json!({

@@ -17,7 +17,7 @@ use crate::photographs::image::Image;
 use crate::results::report::{base64, escape, jpeg};
 use crate::splats::lamp::Lamp;
 use crate::splats::render::RenderSettings;
-use crate::splats::scene::{Facts, Gaussians};
+use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::{Error, Result};
 
 /// The scripts of the page, in one scope.
@@ -36,12 +36,12 @@ pub struct Bookmark {
     /// A pinhole camera in the coordinates of the Gaussians.
     pub camera: Camera,
     /// Captions and images.
-    pub pictures: Vec<(String, Picture)>,
+    pub pictures: Vec<(String, PageImage)>,
 }
 
 /// An image to compare with.
 #[derive(Clone, Debug)]
-pub enum Picture {
+pub enum PageImage {
     /// Part of the page.
     Embedded(Image),
     /// Fetched when it is shown, from an address relative to the page.
@@ -50,7 +50,7 @@ pub enum Picture {
 
 /// The contents of a page.
 #[derive(Clone, Debug)]
-pub struct Page<'a> {
+pub struct ModelPage<'a> {
     /// The window's title.
     pub title: String,
     /// In the colours that viewers expect; `None`: fetched from the page's server, as often as they change.
@@ -71,7 +71,7 @@ pub struct Page<'a> {
     pub lamp: Option<Lamp>,
 }
 
-impl Page<'_> {
+impl ModelPage<'_> {
     /// The page as HTML.
     pub fn html(&self) -> Result<String> {
         let Self { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up, lamp } =
@@ -95,7 +95,7 @@ impl Page<'_> {
         });
         let packed = |gaussians: &Gaussians| Ok::<_, Error>(base64(&gzip(&packed(gaussians))?));
         let model = gaussians.map(packed).transpose()?.unwrap_or_default();
-        let Facts { max_alpha: stated, antialiased, .. } = provenance.facts;
+        let ModelFacts { max_alpha: stated, antialiased, .. } = provenance.facts;
         let max_alpha = stated.unwrap_or_else(|| RenderSettings::default().max_alpha);
         let parts = [
             ("@TITLE@", escape(title)),
@@ -152,8 +152,8 @@ fn view(bookmark: &Bookmark) -> serde_json::Value {
     let Camera { width, height, focal, principal_point, view_from_world, .. } = camera;
     let pictures = pictures.iter().map(|(label, picture)| {
         let image = match picture {
-            Picture::Embedded(image) => jpeg(image),
-            Picture::At(address) => address.clone(),
+            PageImage::Embedded(image) => jpeg(image),
+            PageImage::At(address) => address.clone(),
         };
         json!({ "label": label, "image": image })
     });
@@ -207,9 +207,9 @@ mod tests {
             view_from_world: DAffine3::IDENTITY,
         };
         let evil = "</script><b>@MODEL@";
-        let picture = Picture::Embedded(Image::from_fn(4, 3, |_, _| [0.5; 3]));
+        let picture = PageImage::Embedded(Image::from_fn(4, 3, |_, _| [0.5; 3]));
         let picture = (evil.to_owned(), picture);
-        let page = Page {
+        let page = ModelPage {
             title: evil.to_owned(),
             gaussians: Some(&gaussians),
             provenance: Provenance { dataset: evil.to_owned(), ..Provenance::default() },
@@ -230,11 +230,11 @@ mod tests {
         assert!(html.contains(&constant("DILATION", DILATION)) && html.contains("void sh_basis("));
         assert_eq!(html.matches(&constant("ALPHA_MIN", ALPHA_MIN)).count(), 2);
         assert!(html.contains("const bool ANTIALIASED = false;"));
-        let facts = Facts { antialiased: true, ..Facts::default() };
+        let facts = ModelFacts { antialiased: true, ..ModelFacts::default() };
         let provenance = Provenance { facts, ..Provenance::default() };
-        let compensated = Page { provenance, ..page.clone() }.html().unwrap();
+        let compensated = ModelPage { provenance, ..page.clone() }.html().unwrap();
         assert!(compensated.contains("const bool ANTIALIASED = true;"));
-        let lit = Page { lamp: Some(Lamp::AT_CAMERA), ..page.clone() }.html().unwrap();
+        let lit = ModelPage { lamp: Some(Lamp::AT_CAMERA), ..page.clone() }.html().unwrap();
         assert!(lit.contains("\"reference_distance\":1.0") && html.contains("\"lamp\":null"));
         assert_eq!(html.matches("<script").count(), html.matches("</script>").count());
         for outside in ["http://", "https://", "src=\"/", "@import"] {

@@ -57,7 +57,7 @@ pub(super) fn vectors(points: &[f32], width: usize, size: usize) -> (Vec<f32>, V
     let mut order: Vec<u32> = (0..count as u32).collect();
     let mut heap = std::collections::BinaryHeap::new();
     if count > 0 {
-        heap.push(Cell::new(points, width, &order, 0..count));
+        heap.push(Cluster::new(points, width, &order, 0..count));
     }
     while heap.len() < size {
         let Some(cell) = heap.pop() else { break };
@@ -71,11 +71,11 @@ pub(super) fn vectors(points: &[f32], width: usize, size: usize) -> (Vec<f32>, V
         part.sort_by_key(|&point| value(point) > cell.mean);
         let middle = cell.range.start + part.partition_point(|&point| value(point) <= cell.mean);
         if middle == cell.range.start || middle == cell.range.end {
-            heap.push(Cell { error: 0.0, ..cell });
+            heap.push(Cluster { error: 0.0, ..cell });
             continue;
         }
         for range in [cell.range.start..middle, middle..cell.range.end] {
-            heap.push(Cell::new(points, width, &order, range));
+            heap.push(Cluster::new(points, width, &order, range));
         }
     }
     let mut cells = heap.into_vec();
@@ -90,7 +90,7 @@ pub(super) fn vectors(points: &[f32], width: usize, size: usize) -> (Vec<f32>, V
 }
 
 /// A subset of the points.
-struct Cell {
+struct Cluster {
     range: Range<usize>,
     /// The axis of the largest variance, with the mean along it and the sum of squared distances to the mean.
     axis: usize,
@@ -98,7 +98,7 @@ struct Cell {
     error: f64,
 }
 
-impl Cell {
+impl Cluster {
     fn new(points: &[f32], width: usize, order: &[u32], range: Range<usize>) -> Self {
         let members = &order[range.clone()];
         let (axis, (mean, error)) = (0..width)
@@ -115,25 +115,25 @@ fn moments(points: &[f32], width: usize, members: &[u32], axis: usize) -> (f64, 
     (mean, members.iter().map(|point| (value(point) - mean).powi(2)).sum())
 }
 
-impl Ord for Cell {
+impl Ord for Cluster {
     fn cmp(&self, other: &Self) -> std::cmp::Ordering {
         self.error.total_cmp(&other.error).then(other.range.start.cmp(&self.range.start))
     }
 }
 
-impl PartialOrd for Cell {
+impl PartialOrd for Cluster {
     fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
         Some(self.cmp(other))
     }
 }
 
-impl PartialEq for Cell {
+impl PartialEq for Cluster {
     fn eq(&self, other: &Self) -> bool {
         self.cmp(other).is_eq()
     }
 }
 
-impl Eq for Cell {}
+impl Eq for Cluster {}
 
 #[cfg(test)]
 mod tests {

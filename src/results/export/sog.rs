@@ -17,7 +17,7 @@ use zip::write::{SimpleFileOptions, ZipWriter};
 use super::palette::{codebook, nearest, vectors};
 use super::{GENERATOR, Provenance, raw_opacity, sigmoid, unit};
 use crate::base::output::{create_folder, write_whole};
-use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE, rest_coefficients};
+use crate::splats::scene::{Gaussians, MAX_SH_DEGREE, ModelFacts, rest_coefficients};
 use crate::{Error, Result};
 
 /// Vectors of coefficients per row of their image.
@@ -37,7 +37,7 @@ pub(super) fn write_folder(
     counts: &[usize],
 ) -> Result<()> {
     create_folder(folder)?;
-    let Encoded { meta, images } = encoded(gaussians, provenance, counts);
+    let SogFiles { meta, images } = encoded(gaussians, provenance, counts);
     for image in &images {
         write_whole(&folder.join(image.name), &image.webp()?)?;
     }
@@ -48,7 +48,7 @@ pub(super) fn write_folder(
 pub(super) const META: &str = "meta.json";
 
 /// A model as a description and images.
-struct Encoded {
+struct SogFiles {
     meta: String,
     images: Vec<Pixmap>,
 }
@@ -75,7 +75,7 @@ fn failed(error: &dyn std::fmt::Display) -> Error {
 }
 
 /// The Gaussians of each cell in the order of a Z-order curve.
-fn encoded(gaussians: &Gaussians, provenance: &Provenance, counts: &[usize]) -> Encoded {
+fn encoded(gaussians: &Gaussians, provenance: &Provenance, counts: &[usize]) -> SogFiles {
     let (bounds, positions) = positions(gaussians);
     // Neighbours in space are neighbours in the images, which compresses better.
     let mut order: Vec<usize> = (0..gaussians.count).collect();
@@ -155,7 +155,7 @@ fn encoded(gaussians: &Gaussians, provenance: &Provenance, counts: &[usize]) -> 
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         });
     }
-    Encoded { meta: meta.to_string(), images }
+    SogFiles { meta: meta.to_string(), images }
 }
 
 /// Minimum and maximum of the signed logarithm per axis, and each position between them in 16 bits.
@@ -212,7 +212,7 @@ fn image_size(count: usize) -> [usize; 2] {
     [width, count.div_ceil(width).max(1)]
 }
 
-fn archive(Encoded { meta, images }: &Encoded) -> Result<Vec<u8>> {
+fn archive(SogFiles { meta, images }: &SogFiles) -> Result<Vec<u8>> {
     // Stored, since the images are compressed.
     let stored = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
     let mut zip = ZipWriter::new(Cursor::new(vec![]));
@@ -266,7 +266,7 @@ struct Rest {
 const MOST: u64 = 1 << 30;
 
 /// The Gaussians of a file of version 2, and the facts that it states.
-pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
+pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, ModelFacts), String> {
     let mut zip =
         ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is not a SOG: {error}"))?;
     let meta = bytes_of(&mut zip, META)?;
@@ -314,7 +314,7 @@ pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     if let Some(index) = gaussians.parameters.iter().position(|value| !value.is_finite()) {
         return Err(format!("number {index} is not finite"));
     }
-    let facts = Facts::of_json(&meta.asset["nightsplat"])?;
+    let facts = ModelFacts::of_json(&meta.asset["nightsplat"])?;
     gaussians.origin = facts.origin;
     Ok((gaussians, facts))
 }
@@ -354,9 +354,9 @@ fn bytes_of(zip: &mut Archive<'_>, name: &str) -> Result<Vec<u8>, String> {
 }
 
 /// Pixels, and their number in a row.
-struct Pixels(Vec<[u8; 4]>, usize);
+struct SogPixels(Vec<[u8; 4]>, usize);
 
-impl std::ops::Index<usize> for Pixels {
+impl std::ops::Index<usize> for SogPixels {
     type Output = [u8; 4];
 
     fn index(&self, pixel: usize) -> &[u8; 4] {
@@ -365,14 +365,14 @@ impl std::ops::Index<usize> for Pixels {
 }
 
 /// An image of at least `count` pixels.
-fn image_of(zip: &mut Archive<'_>, name: &str, count: usize) -> Result<Pixels, String> {
+fn image_of(zip: &mut Archive<'_>, name: &str, count: usize) -> Result<SogPixels, String> {
     let image = image::load_from_memory_with_format(&bytes_of(zip, name)?, ImageFormat::WebP);
     let image = image.map_err(|error| format!("{name}: {error}"))?.to_rgba8();
     let (pixels, _) = image.as_raw().as_chunks();
     if pixels.len() < count {
         return Err(format!("{name} has {} pixels for {count} Gaussians", pixels.len()));
     }
-    Ok(Pixels(pixels.to_vec(), image.width() as usize))
+    Ok(SogPixels(pixels.to_vec(), image.width() as usize))
 }
 
 /// The three numbers that a pixel encodes.
@@ -406,7 +406,7 @@ mod tests {
         for degree in [0, 2] {
             let mut model = drawn(300, degree);
             model.origin = glam::DVec3::new(4_499_999.6, -519_997.7, 10_001.8);
-            let facts = Facts {
+            let facts = ModelFacts {
                 near: Some(0.1),
                 max_alpha: Some(0.999),
                 raw_colors: Some(true),
@@ -441,7 +441,7 @@ mod tests {
             assert!((sum(&back) - sum(&model)).abs().max_element() < 0.5, "{degree}");
         }
         let (_, nothing) = decode(&encode(&drawn(3, 0), &Provenance::default()).unwrap()).unwrap();
-        assert_eq!(nothing, Facts::default());
+        assert_eq!(nothing, ModelFacts::default());
     }
 
     #[test]
@@ -455,7 +455,7 @@ mod tests {
             edited[byte] ^= 0x41;
             drop(decode(&edited));
         }
-        let of_meta = |meta: &str| Encoded { meta: meta.to_owned(), images: vec![] };
+        let of_meta = |meta: &str| SogFiles { meta: meta.to_owned(), images: vec![] };
         let problem = |meta: &str| decode(&archive(&of_meta(meta)).unwrap()).unwrap_err();
         assert_eq!(problem(r#"{"version":1}"#), "is SOG of version 1; version 2 is read");
         assert!(problem(r#"{"version":2,"count":1}"#).contains("missing field `means`"));

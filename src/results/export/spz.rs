@@ -14,7 +14,7 @@ use ruzstd::decoding::StreamingDecoder;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 
 use super::{Provenance, gzip_with, half_turn, raw_opacity, sigmoid, unit};
-use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE, rest_coefficients};
+use crate::splats::scene::{Gaussians, MAX_SH_DEGREE, ModelFacts, rest_coefficients};
 use crate::{Error, Result};
 
 const MAGIC: u32 = 0x5053_474e;
@@ -87,7 +87,7 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) 
 }
 
 /// The Gaussians of a file of version 2, 3 or 4, and the facts that it states.
-pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
+pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, ModelFacts), String> {
     let (header, streams, text) = match file {
         [0x1f, 0x8b, ..] => unzipped(file)?,
         _ => unpacked(file)?,
@@ -114,14 +114,14 @@ pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
         };
     }
     let mut gaussians = half_turn(&gaussians);
-    let mut facts = Facts { antialiased: header.antialiased, ..Facts::default() };
+    let mut facts = ModelFacts { antialiased: header.antialiased, ..ModelFacts::default() };
     String::from_utf8_lossy(&text).lines().try_for_each(|line| facts.set_line(line))?;
     gaussians.origin = facts.origin;
     Ok((gaussians, facts))
 }
 
 /// The words at the start of every version.
-struct Header {
+struct SpzHeader {
     version: u32,
     count: usize,
     degree: u32,
@@ -134,7 +134,7 @@ type Streams = [Vec<u8>; 6];
 
 const TRUNCATED: &str = "is truncated";
 
-impl Header {
+impl SpzHeader {
     fn parse(bytes: &[u8]) -> Result<Self, String> {
         let word = |at| word(bytes, at);
         if word(0)? != MAGIC {
@@ -178,9 +178,9 @@ fn exactly(decoder: &mut impl Read, length: usize) -> Result<Vec<u8>, String> {
 }
 
 /// Header, streams and comment of version 2 or 3.
-fn unzipped(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
+fn unzipped(file: &[u8]) -> Result<(SpzHeader, Streams, Vec<u8>), String> {
     let mut decoder = GzDecoder::new(file);
-    let header = Header::parse(&exactly(&mut decoder, 16)?)?;
+    let header = SpzHeader::parse(&exactly(&mut decoder, 16)?)?;
     if !(2..=3).contains(&header.version) {
         return Err(header.refused());
     }
@@ -199,8 +199,8 @@ fn unzipped(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
 }
 
 /// Header, streams and what follows them, of version 4.
-fn unpacked(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
-    let header = Header::parse(file)?;
+fn unpacked(file: &[u8]) -> Result<(SpzHeader, Streams, Vec<u8>), String> {
+    let header = SpzHeader::parse(file)?;
     if header.version != 4 {
         return Err(header.refused());
     }
@@ -371,7 +371,7 @@ mod tests {
     fn a_decoded_model_agrees_within_its_precision_and_has_the_stated_facts() {
         let mut model = drawn(37, 3);
         model.origin = glam::DVec3::new(4_499_999.6, -519_997.7, 10_001.8);
-        let facts = Facts {
+        let facts = ModelFacts {
             near: Some(0.1),
             max_alpha: Some(0.999),
             raw_colors: Some(true),
@@ -404,12 +404,12 @@ mod tests {
             assert_eq!((again.means(), again.dc()), (back.means(), back.dc()), "{version:?}");
         }
         let (_, nothing) = decode(&encode_alone(&drawn(3, 0), Version::V4)).unwrap();
-        assert_eq!(nothing, Facts::default());
+        assert_eq!(nothing, ModelFacts::default());
     }
 
     #[test]
     fn a_truncated_or_edited_file_is_an_error_and_not_a_panic() {
-        let facts = Facts { near: Some(0.1), ..Facts::default() };
+        let facts = ModelFacts { near: Some(0.1), ..ModelFacts::default() };
         let provenance = Provenance { facts, ..Provenance::default() };
         for version in [Version::V3, Version::V4] {
             let file = encode(&drawn(5, 1), &provenance, version).unwrap();

@@ -22,7 +22,7 @@ use serde_json::{Value, json};
 use super::{GENERATOR, Provenance, sog};
 use crate::base::output::{create_folder, write_whole};
 use crate::splats::levels::{self, Cells};
-use crate::splats::scene::{Facts, Gaussians};
+use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::{Error, Result};
 
 /// The index, by whose name loaders recognise the format.
@@ -35,7 +35,7 @@ const LEAVES_PER_CHUNK: usize = 4;
 pub const MAX_LEVELS: usize = 16;
 
 /// A part of a model that is loaded at once.
-pub struct Tile<'a> {
+pub struct TileLoader<'a> {
     /// For messages.
     pub name: PathBuf,
     /// How many Gaussians it has.
@@ -44,7 +44,7 @@ pub struct Tile<'a> {
     pub load: Box<dyn Fn() -> Result<Cow<'a, Gaussians>> + 'a>,
 }
 
-impl<'a> Tile<'a> {
+impl<'a> TileLoader<'a> {
     /// A model as one tile.
     pub fn whole(name: &Path, gaussians: &'a Gaussians) -> Self {
         let load = Box::new(move || Ok(Cow::Borrowed(gaussians)));
@@ -52,7 +52,7 @@ impl<'a> Tile<'a> {
     }
 }
 
-impl std::fmt::Debug for Tile<'_> {
+impl std::fmt::Debug for TileLoader<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Tile").field("name", &self.name).field("count", &self.count).finish()
     }
@@ -103,7 +103,7 @@ pub struct Written {
 /// have its count, [`Error::Usage`] if there are no Gaussians; and those of loading a tile.
 pub fn write(
     folder: &Path,
-    tiles: &[Tile<'_>],
+    tiles: &[TileLoader<'_>],
     provenance: &Provenance,
     division: Division,
 ) -> Result<Written> {
@@ -113,7 +113,7 @@ pub fn write(
     }
     prepare(folder)?;
     let levels = division.levels_of(total);
-    let mut chunks = Chunks::new(folder, provenance, division.chunk, levels);
+    let mut chunks = ChunkWriter::new(folder, provenance, division.chunk, levels);
     let (mut nodes, mut origin) = (vec![], None);
     for tile in tiles.iter().filter(|tile| tile.count > 0) {
         let gaussians = (tile.load)()?;
@@ -128,7 +128,7 @@ pub fn write(
     }
     let root = tree_of(nodes).ok_or_else(|| Error::Usage("no tile has Gaussians".to_owned()))?;
     let mut asset = json!({ "generator": GENERATOR, "provenance": provenance.lines() });
-    let facts = Facts { origin: origin.unwrap_or_default(), ..provenance.facts };
+    let facts = ModelFacts { origin: origin.unwrap_or_default(), ..provenance.facts };
     asset["nightsplat"] = facts.json();
     let index = json!({
         "version": 1,
@@ -196,7 +196,7 @@ impl Bounds {
     const NONE: Self = Self { min: DVec3::INFINITY, max: DVec3::NEG_INFINITY };
 
     /// Of ellipsoids of one standard deviation.
-    fn of(gaussians: &Gaussians) -> Self {
+    fn new(gaussians: &Gaussians) -> Self {
         (0..gaussians.count).fold(Self::NONE, |bounds, index| {
             let mean = gaussians.means()[index].as_dvec3();
             let [w, x, y, z] = gaussians.quats()[index].map(f64::from);
@@ -250,20 +250,20 @@ fn tree_of(mut nodes: Vec<Node>) -> Option<Node> {
 }
 
 /// The levels of a cell.
-struct Leaf {
+struct CellLevels {
     bounds: Bounds,
     levels: Vec<Gaussians>,
     /// How far each is from level 0.
     errors: Vec<f64>,
 }
 
-impl Leaf {
+impl CellLevels {
     fn new(cell: Gaussians, count: usize) -> Self {
-        let bounds = Bounds::of(&cell);
+        let bounds = Bounds::new(&cell);
         let mut leaf = Self { bounds, levels: vec![cell], errors: vec![0.0] };
         for level in 1..count {
             let (next, change) = levels::coarser(&leaf.levels[level - 1]);
-            leaf.bounds = leaf.bounds.with(Bounds::of(&next));
+            leaf.bounds = leaf.bounds.with(Bounds::new(&next));
             leaf.errors.push(leaf.errors[level - 1] + change);
             leaf.levels.push(next);
         }
@@ -272,15 +272,16 @@ impl Leaf {
 }
 
 /// Writes the chunks of a tile's cells, and returns its tree.
-fn tile_node(gaussians: &Gaussians, most: usize, chunks: &mut Chunks<'_>) -> Result<Node> {
+fn tile_node(gaussians: &Gaussians, most: usize, chunks: &mut ChunkWriter<'_>) -> Result<Node> {
     let Cells { order, cells } = Cells::new(gaussians.means(), most);
     let levels = chunks.pending.len();
-    let leaf = |cell: &Range<usize>| Leaf::new(gaussians.select(&order[cell.clone()]), levels);
+    let leaf =
+        |cell: &Range<usize>| CellLevels::new(gaussians.select(&order[cell.clone()]), levels);
     let mut nodes = Vec::with_capacity(cells.len());
     // As many at once as there are threads: their levels are in memory.
     for some in cells.chunks(rayon::current_num_threads()) {
-        let leaves: Vec<Leaf> = some.par_iter().map(leaf).collect();
-        for Leaf { bounds, levels, errors } in leaves {
+        let leaves: Vec<CellLevels> = some.par_iter().map(leaf).collect();
+        for CellLevels { bounds, levels, errors } in leaves {
             let lods = chunks.add(levels)?;
             let errors: Vec<f64> =
                 errors.into_iter().map(|error| f64::from(error as f32)).collect();
@@ -303,7 +304,7 @@ fn nested(count: usize, most: usize, leaves: &mut impl Iterator<Item = Node>) ->
 }
 
 /// The chunks of all levels.
-struct Chunks<'a> {
+struct ChunkWriter<'a> {
     folder: &'a Path,
     provenance: &'a Provenance,
     most: usize,
@@ -324,7 +325,7 @@ struct Pending {
     count: usize,
 }
 
-impl<'a> Chunks<'a> {
+impl<'a> ChunkWriter<'a> {
     fn new(folder: &'a Path, provenance: &'a Provenance, most: usize, levels: usize) -> Self {
         let pending = (0..levels).map(|_| Pending::default()).collect();
         Self { folder, provenance, most, pending, names: vec![], counts: vec![0; levels] }

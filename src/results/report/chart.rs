@@ -355,7 +355,7 @@ fn legend_places(series: &[Series]) -> (Vec<DVec2>, f64) {
     }
     // The last row is that of the axis label.
     let above = at.y - 14.0;
-    places.iter_mut().for_each(|place| place.y -= above);
+    places.iter_mut().for_each(|corner| corner.y -= above);
     (places, above)
 }
 

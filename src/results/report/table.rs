@@ -29,7 +29,7 @@ pub struct Column {
 
 /// A table: a label and a number per column in each row.
 #[derive(Clone, Debug, Default)]
-pub struct Table {
+pub struct NumberTable {
     /// The caption; may be empty.
     pub title: String,
     /// The heading of the labels.
@@ -40,7 +40,7 @@ pub struct Table {
     pub rows: Vec<(String, Vec<Option<f64>>)>,
 }
 
-impl Table {
+impl NumberTable {
     /// The table as a section of an HTML page, with the best values highlighted.
     pub fn html(&self) -> String {
         let mut html = format!(

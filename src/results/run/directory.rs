@@ -255,8 +255,8 @@ impl RunDirectory {
     /// Appends the checksum of every parameter plane to `hashes.csv`.
     pub(super) fn log_hashes(&self, step: u64, gaussians: &Gaussians) -> Result<()> {
         let path = self.path.join(HASHES);
-        let known = std::fs::read_to_string(&path).unwrap_or_default();
-        let text = ledger::extended(&known, step, gaussians);
+        let recorded = std::fs::read_to_string(&path).unwrap_or_default();
+        let text = ledger::extended(&recorded, step, gaussians);
         write_whole(&path, text.as_bytes())
     }
 

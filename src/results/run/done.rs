@@ -62,7 +62,7 @@ fn load(run: &Path) -> Option<Done> {
 pub fn done_steps(run: &Path, config: &TrainConfig, dataset: &Dataset) -> Result<Option<u64>> {
     let Some(done) = load(run) else { return Ok(None) };
     let is_same = done.configuration == config.checksum()?
-        && done.dataset == Fingerprint::of(dataset)?.checksum();
+        && done.dataset == Fingerprint::compute(dataset)?.checksum();
     Ok(is_same.then_some(done.steps))
 }
 
@@ -73,6 +73,7 @@ pub fn done_steps_by_stamp(run: &Path, config: &TrainConfig) -> Result<Option<u6
         return Ok(None);
     };
     let is_same = configuration == config.checksum()?
-        && Dataset::stamp(&config.dataset, &config.load_options()).is_ok_and(|own| own == stamp);
+        && Dataset::stamp(&config.dataset, &config.load_options())
+            .is_ok_and(|current| current == stamp);
     Ok(is_same.then_some(steps))
 }

@@ -9,18 +9,18 @@ use crate::base::hash;
 use crate::splats::scene::{ATTRIBUTES, Gaussians};
 
 /// The table with a line for `step`. Lines of this and later steps are removed: a resumed run repeats them.
-pub(super) fn extended(known: &str, step: u64, gaussians: &Gaussians) -> String {
+pub(super) fn extended(recorded: &str, step: u64, gaussians: &Gaussians) -> String {
     let names = ATTRIBUTES.each_ref().map(|spec| spec.name).join(",");
     let is_before = |line: &&str| {
-        let own = line.split(',').next().and_then(|own| own.parse::<u64>().ok());
-        own.is_some_and(|own| own < step)
+        let row_step = line.split(',').next().and_then(|row_step| row_step.parse::<u64>().ok());
+        row_step.is_some_and(|row_step| row_step < step)
     };
     let plane = |attribute| {
         let plane = &gaussians.parameters[gaussians.plane(attribute)];
-        hash::text(hash::of(bytemuck::cast_slice(plane)))
+        hash::text(hash::checksum(bytemuck::cast_slice(plane)))
     };
     let planes = ATTRIBUTES.each_ref().map(|spec| plane(spec.attribute)).join(",");
-    let lines = known.lines().filter(is_before).map(|line| format!("{line}\n"));
+    let lines = recorded.lines().filter(is_before).map(|line| format!("{line}\n"));
     format!(
         "step,gaussians,{names}\n{}{step},{},{planes}\n",
         lines.collect::<String>(),

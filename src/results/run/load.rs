@@ -12,7 +12,7 @@ use crate::base::input;
 use crate::gpu::Gpu;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::Dataset;
-use crate::splats::joined::Manifest;
+use crate::splats::joined::TileManifest;
 use crate::splats::lamp::Lamp;
 use crate::splats::scene::{Features, Gaussians, ply};
 use crate::train::{ModelConfig, Networks, TrainConfig};
@@ -90,7 +90,7 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
 /// The trained Gaussians of a run, or those of the joined blocks of a scene, in the colours that viewers show.
 pub fn load_gaussians(run: &Path) -> Result<Gaussians> {
     let path = run.join("model.ply");
-    if let Some(manifest) = Manifest::of_scene(run)? {
+    if let Some(manifest) = TileManifest::of_scene(run)? {
         return manifest.gaussians();
     }
     if !path.is_file() {
@@ -136,18 +136,21 @@ pub fn load_lamp(run: &Path) -> Result<Option<Lamp>> {
 /// The learned exposures of a run's training views relative to its model, by name; empty if none were learned.
 pub fn load_exposures(run: &Path) -> Result<BTreeMap<String, Affine>> {
     let path = run.join(EXPOSURES);
-    let known = if path.is_file() { table::load(&path)? } else { vec![] };
-    Ok(known.into_iter().filter_map(|known| Some((known.name, known.affine?))).collect())
+    let exposures = if path.is_file() { table::load(&path)? } else { vec![] };
+    Ok(exposures
+        .into_iter()
+        .filter_map(|exposures| Some((exposures.name, exposures.affine?)))
+        .collect())
 }
 
 /// The difference between the views of a dataset and those of a run, in words; `None` if they are equal, or the run has
 /// no list of views.
 pub fn other_views(run: &Path, dataset: &Dataset) -> Option<String> {
     let text = std::fs::read_to_string(run.join(VIEWS)).ok()?;
-    let own: BTreeSet<&str> = text.lines().skip(1).collect();
+    let views: BTreeSet<&str> = text.lines().skip(1).collect();
     let lines = view_lines(dataset);
     let others: BTreeSet<&str> = lines.iter().map(String::as_str).collect();
-    let [gone, new] = [own.difference(&others), others.difference(&own)].map(|lines| {
+    let [gone, new] = [views.difference(&others), others.difference(&views)].map(|lines| {
         let lines: Vec<&str> = lines.copied().collect();
         lines.first().map(|first| format!("{} (the first: {first})", lines.len()))
     });

@@ -78,7 +78,7 @@ fn taken(run: &Path, path: &Path) -> Error {
 fn is_at(file: &File, path: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;
     let both = file.metadata().ok().zip(path.metadata().ok());
-    both.is_some_and(|(own, there)| (own.dev(), own.ino()) == (there.dev(), there.ino()))
+    both.is_some_and(|(ours, there)| (ours.dev(), ours.ino()) == (there.dev(), there.ino()))
 }
 
 /// An open file cannot be removed.

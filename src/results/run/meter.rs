@@ -49,7 +49,7 @@ impl ResourceMeter {
     }
 
     /// Runs `work` and adds its resources.
-    pub(super) fn of<T>(&mut self, work: impl FnOnce() -> T) -> T {
+    pub(super) fn measure<T>(&mut self, work: impl FnOnce() -> T) -> T {
         let energy = |meter: &Self| meter.counters.iter().map(Counter::read).collect::<Vec<_>>();
         let (joules, processor, begin) = (energy(self), processor_seconds(), Instant::now());
         let done = work();
@@ -194,12 +194,12 @@ mod tests {
     #[cfg(target_os = "linux")]
     fn work_takes_time_and_memory_and_idling_takes_no_processor() {
         let mut meter = ResourceMeter::new(0.0);
-        meter.of(|| std::thread::sleep(std::time::Duration::from_millis(60)));
+        meter.measure(|| std::thread::sleep(std::time::Duration::from_millis(60)));
         let idle = meter.spent(7);
         assert!(idle.seconds >= 0.06 && idle.processor_seconds.unwrap() < 60.0, "{idle:?}");
         assert!(idle.device_bytes == 7 && idle.host_bytes.unwrap() > 1 << 20, "{idle:?}");
         let begin = processor_seconds().unwrap();
-        meter.of(|| while processor_seconds().unwrap() < begin + 0.05 {});
+        meter.measure(|| while processor_seconds().unwrap() < begin + 0.05 {});
         let busy = meter.spent(7).processor_seconds.unwrap() - idle.processor_seconds.unwrap();
         assert!(busy >= 0.04, "{busy}");
         assert_eq!(

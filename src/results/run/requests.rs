@@ -54,8 +54,8 @@ impl Requests {
 
     /// The cause of a request to stop, if there is one.
     pub(crate) fn stops(&self) -> Option<Stop> {
-        let place = self.stop.load(Ordering::Relaxed).checked_sub(1)?;
-        STOPS.get(place).copied()
+        let index = self.stop.load(Ordering::Relaxed).checked_sub(1)?;
+        STOPS.get(index).copied()
     }
 
     /// Whether a save was requested since the last call.
@@ -70,7 +70,7 @@ impl Requests {
 
     /// The number of a cause in [`Requests::stop_flag`].
     pub(crate) fn code(cause: Stop) -> usize {
-        STOPS.iter().position(|&stop| stop == cause).map_or(0, |place| place + 1)
+        STOPS.iter().position(|&stop| stop == cause).map_or(0, |index| index + 1)
     }
 
     /// The flag of [`Requests::save`], for signal handlers.

@@ -65,11 +65,11 @@ impl WatchedRun {
     /// Reads the ends of its files. What is missing or being written is left out.
     pub(crate) fn tail(&mut self) -> RunTail {
         let stamp = stamp(&self.path.join("config.toml")).ok();
-        if self.steps.map(|(known, _)| known) != stamp {
+        if self.steps.map(|(stamp_read, _)| stamp_read) != stamp {
             let steps = load_config(&self.path).ok().map(|config| config.steps);
             self.steps = stamp.map(|stamp| (stamp, steps));
         }
-        RunTail::of(&self.path, self.steps.and_then(|(_, steps)| steps))
+        RunTail::read(&self.path, self.steps.and_then(|(_, steps)| steps))
     }
 }
 
@@ -83,7 +83,7 @@ pub(crate) fn stamp(path: &Path) -> std::io::Result<Stamp> {
 }
 
 impl RunTail {
-    fn of(run: &Path, steps: Option<u64>) -> Self {
+    fn read(run: &Path, steps: Option<u64>) -> Self {
         let rows = last_rows(&run.join(LOG)).unwrap_or_default();
         let last = rows.last();
         let times: Vec<f64> = rows.iter().map(|row| row.milliseconds).collect();
@@ -112,14 +112,14 @@ impl RunTail {
     }
 }
 
-struct Row {
+struct RunLogRow {
     step: u64,
     loss: f64,
     gaussians: u64,
     milliseconds: f64,
 }
 
-impl Row {
+impl RunLogRow {
     /// Parses a whole line of the log: step, view, loss, the terms, Gaussians, milliseconds. The view may be quoted and
     /// contain commas.
     fn parse(line: &str) -> Option<Self> {
@@ -140,7 +140,7 @@ impl Row {
 }
 
 /// The whole lines at the end of the log.
-fn last_rows(log: &Path) -> std::io::Result<Vec<Row>> {
+fn last_rows(log: &Path) -> std::io::Result<Vec<RunLogRow>> {
     let mut file = File::open(log)?;
     let length = file.metadata()?.len();
     file.seek(SeekFrom::Start(length.saturating_sub(TAIL)))?;
@@ -149,7 +149,7 @@ fn last_rows(log: &Path) -> std::io::Result<Vec<Row>> {
     let text = String::from_utf8_lossy(&bytes);
     // The first line may be cut; the last may not be written to its end.
     let lines = text.split_inclusive('\n').skip(1).filter_map(|line| line.strip_suffix('\n'));
-    Ok(lines.filter_map(Row::parse).collect())
+    Ok(lines.filter_map(RunLogRow::parse).collect())
 }
 
 #[cfg(test)]

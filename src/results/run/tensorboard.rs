@@ -254,7 +254,7 @@ mod tests {
         file.flush().unwrap();
         let read = events(&file.path);
         let field = |event: usize, number: u64| -> Vec<u8> {
-            read[event].iter().find(|(own, _)| *own == number).unwrap().1.clone()
+            read[event].iter().find(|(found, _)| *found == number).unwrap().1.clone()
         };
         assert_eq!(field(0, 3), b"brain.Event:2");
         let step = |event| u64::from_le_bytes(field(event, 2).try_into().unwrap());
@@ -269,7 +269,7 @@ mod tests {
         let picture = fields(&fields(&field(3, 5))[0].1);
         let image = fields(&picture[1].1);
         let number = |bytes: &Vec<u8>| u64::from_le_bytes(bytes.clone().try_into().unwrap());
-        assert_eq!([0, 1, 2].map(|place| number(&image[place].1)), [480, 640, 3]);
+        assert_eq!([0, 1, 2].map(|index| number(&image[index].1)), [480, 640, 3]);
         assert_eq!(image[3], (4, b"pixels".to_vec()));
         // A second file of the same second gets another name.
         let again = EventFile::create(folder.path(), 0).unwrap();

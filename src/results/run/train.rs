@@ -288,7 +288,7 @@ impl<'a> TrainLoop<'a> {
             let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
             let until = [config.eval_every, config.checkpoint_every, config.hash_every];
             let until = until.into_iter().filter_map(next).min().unwrap_or(config.steps);
-            let reports = self.meter.of(|| trainer.advance(until))?;
+            let reports = self.meter.measure(|| trainer.advance(until))?;
             for report in &reports {
                 losses.push(report.loss);
                 directory.log(report)?;
@@ -408,7 +408,7 @@ impl<'a> TrainLoop<'a> {
     ) -> Result<Evaluation> {
         let _phase = tracing::info_span!("scoring").entered();
         let mut score_reference = match self.score_reference.take() {
-            Some(known) => known,
+            Some(reference) => reference,
             None => ScoreReference::in_scene(self.gpu, self.dataset, trainer.scene())?,
         };
         let (step, mut is_first) = (trainer.steps_done(), true);
@@ -468,7 +468,7 @@ impl TrainLoop<'_> {
             values.push(("model/Gaussians".to_owned(), *gaussians as f64));
             values.push(("model/milliseconds a step".to_owned(), *milliseconds));
             let rates = trainer.learning_rates(*step);
-            let rate = |own: &AttributeSpec| named("rates", own.name, rates[own.attribute]);
+            let rate = |spec: &AttributeSpec| named("rates", spec.name, rates[spec.attribute]);
             values.extend(ATTRIBUTES.iter().map(rate));
             events.scalars(*step, &values)?;
         }

@@ -12,7 +12,7 @@ use crate::photographs::tone::ToneCurve;
 use crate::results::edit::fingerprint;
 use crate::results::eval::ModelRenderer;
 use crate::results::export::Provenance;
-use crate::results::export::page::{Bookmark, Page, Picture, moved};
+use crate::results::export::page::{Bookmark, ModelPage, PageImage, moved};
 use crate::results::finished_run::{FinishedRun, is_model};
 use crate::results::run;
 use crate::splats::render::RenderSettings;
@@ -47,7 +47,7 @@ impl ExportOptions<'_> {
         let is_model = is_model(self.source);
         let frame = if is_model { dataset.frame() } else { config.frame.unwrap_or_default() };
         let near = provenance.facts.near.or(config.facts(&frame).near);
-        let page = Page {
+        let page = ModelPage {
             title: format!("{} by nightsplat", provenance.dataset),
             gaussians: Some(gaussians),
             provenance,
@@ -89,7 +89,7 @@ impl ExportOptions<'_> {
             // A mirrored photograph is of a mirrored world, which the page shows as it is.
             let turned = |(label, image): (&str, Image)| {
                 let image = image.turned(view.orientation.turn());
-                (label.to_owned(), Picture::Embedded(image))
+                (label.to_owned(), PageImage::Embedded(image))
             };
             Ok(Bookmark {
                 name: view.name.clone(),

@@ -1,6 +1,6 @@
 //! The lamp of a renderer on the device, and the gradient of its numbers.
 
-use super::{Purpose, RenderSettings, Renderer, View, color_floats};
+use super::{KernelView, Purpose, RenderSettings, Renderer, color_floats};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Slice, Threads, Tile};
 use crate::kernels::lamp::{LAMP_NUMBERS, LAMP_WIDTH};
@@ -131,7 +131,7 @@ impl Renderer {
         &mut self,
         pass: &mut Recorder<'_>,
         GaussianSlice { layout, parameters }: GaussianSlice<'_>,
-        view: &View<'_>,
+        view: &KernelView<'_>,
         gradients: &Buffer<f32>,
     ) -> Result<()> {
         let (first, channels) = (self.context_count(), self.settings.channels());

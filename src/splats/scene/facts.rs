@@ -10,7 +10,7 @@ use crate::photographs::tone::SceneLaw;
 
 /// Facts that a file states about its model, each with a key and a value, such as `near 0.1`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Facts {
+pub struct ModelFacts {
     /// The near plane, in world units.
     pub near: Option<f32>,
     /// The largest alpha of a splat on a pixel.
@@ -27,7 +27,7 @@ pub struct Facts {
     pub origin: DVec3,
 }
 
-impl Facts {
+impl ModelFacts {
     /// Prefix of a line of text that states a fact.
     pub(crate) const PREFIX: &str = "nightsplat ";
 

@@ -244,7 +244,7 @@ pub fn colors_from_views<I: Borrow<Image>>(
     factor: impl Fn(&View, &Point) -> f32 + Sync,
     mut target: impl FnMut(usize) -> Result<Option<I>>,
 ) -> Result<Vec<Vec3>> {
-    let candidates = Candidates::of(points, views);
+    let candidates = Candidates::new(points, views);
     let mut colors = vec![Mean::default(); points.len()];
     let mut grey = Mean::default();
     for (index, view) in views.iter().enumerate().filter(|(_, view)| view.split == Split::Train) {
@@ -284,7 +284,7 @@ struct Candidates {
 }
 
 impl Candidates {
-    fn of(points: &[Point], views: &[View]) -> Self {
+    fn new(points: &[Point], views: &[View]) -> Self {
         let is_training = |&&view: &&u32| {
             let view = views.get(view as usize);
             view.is_some_and(|view| view.split == Split::Train && view.has_photograph())
@@ -391,7 +391,7 @@ mod tests {
         let points: Vec<Point> =
             (0..30).map(|i| point(if i % 3 == 0 { vec![0, 7] } else { vec![] })).collect();
         let pairs = |count: usize| -> usize {
-            let candidates = Candidates::of(&points, &views(count));
+            let candidates = Candidates::new(&points, &views(count));
             (0..count).flat_map(|view| candidates.of_view(view)).map(<[u32]>::len).sum()
         };
         assert_eq!(pairs(20), 10 * 2 + 20 * 20, "all views of a small set");

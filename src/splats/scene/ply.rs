@@ -14,10 +14,10 @@ use std::fs;
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
 
-use super::{FEATURES, Facts, Feature, Features, Gaussians, MAX_SH_DEGREE, Shape, width};
+use super::{FEATURES, Feature, Features, Gaussians, MAX_SH_DEGREE, ModelFacts, Shape, width};
 use crate::base::input;
 use crate::base::output::write_whole_with;
-use crate::base::ply::{Encoding, Header, Kind};
+use crate::base::ply::{PlyEncoding, PlyHeader, PlyScalar};
 use crate::splats::attributes::{
     ATTRIBUTES, Attribute, AttributePlane, AttributeSpec, Ply, planes, rest_coefficients,
 };
@@ -31,13 +31,13 @@ const NORMALS: [&str; 3] = ["nx", "ny", "nz"];
 
 /// A property of the file: its name, and its attribute and component.
 #[derive(Debug)]
-struct Property {
+struct GaussianProperty {
     name: String,
     attribute: Attribute,
     component: usize,
 }
 
-impl Property {
+impl GaussianProperty {
     /// The property's value is at `begin + stride * gaussian` in [`Gaussians::parameters`].
     fn address(&self, gaussians: &Gaussians) -> (usize, usize) {
         let AttributePlane { column, width, .. } = gaussians.columns(self.attribute);
@@ -46,7 +46,7 @@ impl Property {
 }
 
 /// All properties except the normals, which follow the means, in file order.
-fn properties(shape: Shape) -> Vec<Property> {
+fn properties(shape: Shape) -> Vec<GaussianProperty> {
     let mut specs: Vec<&AttributeSpec> = ATTRIBUTES.iter().collect();
     specs.sort_by_key(|spec| spec.ply_place);
     let planes = planes(shape.features.width(), width(shape));
@@ -65,7 +65,7 @@ fn properties(shape: Shape) -> Vec<Property> {
                 Ply::Numbered(prefix) => format!("{prefix}{position}"),
                 Ply::Features => shape.features.ply_property(position),
             };
-            Property { name, attribute: spec.attribute, component }
+            GaussianProperty { name, attribute: spec.attribute, component }
         })
     };
     specs.into_iter().flat_map(of_attribute).collect()
@@ -116,7 +116,7 @@ fn comment_lines(origin: glam::DVec3, comments: &[impl AsRef<str>]) -> Vec<Strin
 /// A file to which Gaussians are added.
 struct Writer {
     file: BufWriter<fs::File>,
-    properties: Vec<Property>,
+    properties: Vec<GaussianProperty>,
 }
 
 impl Writer {
@@ -180,33 +180,33 @@ pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
 }
 
 /// The Gaussians of a file, and the facts that it states.
-pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
-    let header = Header::parse(bytes)?;
+pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, ModelFacts), String> {
+    let header = PlyHeader::parse(bytes)?;
     let body = &bytes[header.length..];
-    let layout = Layout::of(&header, body.len() as u64)?;
+    let layout = PlyLayout::new(&header, body.len() as u64)?;
     Ok((layout.gaussians(&body[..layout.count * layout.stride], 0)?, layout.facts))
 }
 
 /// Where the numbers of Gaussians are in the vertices of a file.
 #[derive(Debug)]
-struct Layout {
+struct PlyLayout {
     count: usize,
     shape: Shape,
-    facts: Facts,
+    facts: ModelFacts,
     /// Bytes before the first vertex.
     #[cfg(feature = "io")]
     length: usize,
     /// Bytes of a vertex.
     stride: usize,
     /// With the place of each in a vertex.
-    properties: Vec<(usize, Property)>,
+    properties: Vec<(usize, GaussianProperty)>,
 }
 
-impl Layout {
+impl PlyLayout {
     /// Of a file with `length` bytes after its header.
-    fn of(header: &Header, length: u64) -> Result<Self, String> {
-        let &Header { count, stride, .. } = header;
-        if header.encoding != Encoding::Little {
+    fn new(header: &PlyHeader, length: u64) -> Result<Self, String> {
+        let &PlyHeader { count, stride, .. } = header;
+        if header.encoding != PlyEncoding::Little {
             let format = header.encoding.name();
             return Err(format!("is a PLY of format {format}; save it as binary_little_endian"));
         }
@@ -221,7 +221,8 @@ impl Layout {
             return Err(format!("has {more} bytes more than its {count} vertices need"));
         }
         let (facts, shape) = (facts(header)?, shape(header)?);
-        let offset_of = |property: Property| Ok((offset(header, &property.name)?, property));
+        let offset_of =
+            |property: GaussianProperty| Ok((offset(header, &property.name)?, property));
         let properties = properties(shape).into_iter().map(offset_of);
         let properties = properties.collect::<Result<_, String>>()?;
         Ok(Self {
@@ -260,8 +261,8 @@ impl Layout {
 }
 
 /// What the comments state.
-fn facts(header: &Header) -> Result<Facts, String> {
-    let mut facts = Facts::default();
+fn facts(header: &PlyHeader) -> Result<ModelFacts, String> {
+    let mut facts = ModelFacts::default();
     for (line, comment) in &header.comments {
         let stated = match comment.strip_prefix(ORIGIN) {
             Some(numbers) => facts.set("origin", numbers),
@@ -272,12 +273,12 @@ fn facts(header: &Header) -> Result<Facts, String> {
     Ok(facts)
 }
 
-fn shape(header: &Header) -> Result<Shape, String> {
+fn shape(header: &PlyHeader) -> Result<Shape, String> {
     Ok(Shape { sh_degree: sh_degree(header)?, features: features(header) })
 }
 
 /// The features whose first property is present.
-fn features(header: &Header) -> Features {
+fn features(header: &PlyHeader) -> Features {
     let has = |feature: Feature| {
         let name = FEATURES[feature as usize].ply_name;
         header.property(&format!("f_{name}_0")).is_some()
@@ -291,7 +292,7 @@ fn features(header: &Header) -> Features {
 }
 
 /// The degree whose `f_rest_*` properties are all present.
-fn sh_degree(header: &Header) -> Result<u32, String> {
+fn sh_degree(header: &PlyHeader) -> Result<u32, String> {
     let found =
         header.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
     let degree = (0..=MAX_SH_DEGREE).find(|&degree| 3 * rest_coefficients(degree) == found);
@@ -301,9 +302,9 @@ fn sh_degree(header: &Header) -> Result<u32, String> {
 }
 
 /// The byte offset of a float property in the vertex.
-fn offset(header: &Header, name: &str) -> Result<usize, String> {
+fn offset(header: &PlyHeader, name: &str) -> Result<usize, String> {
     match header.property(name) {
-        Some((_, property)) if property.kind == Kind::Float(4) => Ok(property.at),
+        Some((_, property)) if property.kind == PlyScalar::Float(4) => Ok(property.at),
         Some((_, property)) => {
             Err(format!("property `{name}` is of type {}, not float", property.type_name))
         }

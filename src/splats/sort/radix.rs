@@ -14,18 +14,18 @@ use crate::kernels::{sort_downsweep, sort_upsweep};
 #[derive(Debug)]
 pub struct RadixSort {
     gpu: Gpu,
-    kernels: Arc<Kernels>,
+    kernels: Arc<RadixKernels>,
     partition_size: u32,
     /// Partitions of a workgroup.
     subgroups: u32,
     /// Workgroups of a kernel that are done; 0 between kernels.
     arrivals: Buffer<u32>,
-    scratch: Scratch,
+    scratch: SortScratch,
 }
 
 /// The kernels, which sorts on one device share.
 #[derive(Debug)]
-struct Kernels {
+struct RadixKernels {
     upsweep: Pipeline<sort_upsweep::Kernel>,
     downsweep: Pipeline<sort_downsweep::Kernel>,
 }
@@ -36,7 +36,7 @@ const SUBGROUPS_ON_A_GPU: u32 = 8;
 
 /// Scratch memory of a sort.
 #[derive(Debug)]
-struct Scratch {
+struct SortScratch {
     /// Each pass writes the pairs here; then these and the caller's buffers are swapped.
     keys: Buffer<u32>,
     values: Buffer<u32>,
@@ -75,7 +75,7 @@ impl RadixSort {
         };
         Ok(Self {
             gpu: gpu.clone(),
-            kernels: Arc::new(Kernels {
+            kernels: Arc::new(RadixKernels {
                 upsweep: gpu.pipeline(&sort_upsweep::Constants { partition_size, subgroups })?,
                 downsweep: gpu.pipeline(&sort_downsweep::Constants {
                     partition_size,
@@ -86,7 +86,7 @@ impl RadixSort {
             partition_size,
             subgroups,
             arrivals: gpu.zeros("sort_arrivals", 1)?,
-            scratch: Scratch::new(gpu, capacity, [partition_size, subgroups])?,
+            scratch: SortScratch::new(gpu, capacity, [partition_size, subgroups])?,
         })
     }
 
@@ -96,7 +96,7 @@ impl RadixSort {
             gpu: self.gpu.clone(),
             kernels: Arc::clone(&self.kernels),
             arrivals: self.gpu.zeros("sort_arrivals", 1)?,
-            scratch: Scratch::new(&self.gpu, 0, [self.partition_size, self.subgroups])?,
+            scratch: SortScratch::new(&self.gpu, 0, [self.partition_size, self.subgroups])?,
             ..*self
         })
     }
@@ -106,7 +106,7 @@ impl RadixSort {
         if self.scratch.keys.len() != capacity {
             let capacity = common_len("sort", &[capacity])?;
             let shape = [self.partition_size, self.subgroups];
-            self.scratch = Scratch::new(&self.gpu, capacity, shape)?;
+            self.scratch = SortScratch::new(&self.gpu, capacity, shape)?;
         }
         Ok(())
     }
@@ -148,7 +148,7 @@ impl RadixSort {
     ) -> Result<()> {
         let capacity = common_len("sort", &[keys.len(), values.len()])?;
         let Digit { shift, bits: digit_bits, next_bits, index } = *digit;
-        let Scratch { keys: sorted_keys, values: sorted_values, table, digit_begins } =
+        let SortScratch { keys: sorted_keys, values: sorted_values, table, digit_begins } =
             &mut self.scratch;
         let arrivals = &mut self.arrivals;
         let workgroups = capacity.div_ceil(self.partition_size).div_ceil(self.subgroups);
@@ -202,7 +202,7 @@ impl RadixSort {
     }
 }
 
-impl Scratch {
+impl SortScratch {
     fn new(gpu: &Gpu, capacity: u32, [partition_size, subgroups]: [u32; 2]) -> Result<Self> {
         let rows = |count: u32| (count as usize) << MAX_DIGIT_BITS;
         let workgroups = capacity.div_ceil(partition_size).div_ceil(subgroups);

@@ -40,7 +40,7 @@ pub(super) struct Observation {
 
 /// Measurements across the cameras of the training views.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Shared {
+pub(super) struct SceneGeometry {
     /// The number of points of each view: those that it helped to triangulate, if the dataset lists them.
     pub(super) points: Vec<usize>,
     /// For each view, the mean fraction of the other views that see its points.
@@ -53,9 +53,9 @@ pub(super) struct Shared {
     pub(super) observations: Vec<Vec<Observation>>,
 }
 
-impl Shared {
+impl SceneGeometry {
     /// Measures training views, in order.
-    pub(super) fn of(dataset: &Dataset, views: &[(usize, &View)]) -> Result<Self> {
+    pub(super) fn measure(dataset: &Dataset, views: &[(usize, &View)]) -> Result<Self> {
         let random;
         let points = if dataset.points.is_empty() {
             let cameras: Vec<Camera> = views.iter().map(|(_, view)| view.camera).collect();
@@ -171,7 +171,7 @@ fn light_around(image: &Image, at: DVec2) -> Option<(f64, bool)> {
 pub(in crate::train) fn exposures_at_points(dataset: &Dataset) -> Result<BTreeMap<String, f64>> {
     let views: Vec<(usize, &View)> =
         dataset.views.iter().enumerate().filter(|(_, view)| view.is_for_training()).collect();
-    let shared = Shared::of(dataset, &views)?;
+    let shared = SceneGeometry::measure(dataset, &views)?;
     let named = views.iter().zip(shared.exposures);
     Ok(named.filter_map(|((_, view), value)| Some((view.name.clone(), value?))).collect())
 }
@@ -207,8 +207,8 @@ fn exposures(points: &[Vec<Observation>], view_count: usize) -> Vec<Option<f64>>
             of_clipped[one.view].push(one.light - level);
         }
     }
-    for (known, of) in exposures.iter_mut().zip(of_clipped) {
-        *known = known.or_else(|| exposure(of));
+    for (exposure_of_view, of) in exposures.iter_mut().zip(of_clipped) {
+        *exposure_of_view = exposure_of_view.or_else(|| exposure(of));
     }
     center(&mut exposures);
     exposures
@@ -225,8 +225,8 @@ fn exposure(at_points: Vec<f64>) -> Option<f64> {
 }
 
 fn center(exposures: &mut [Option<f64>]) {
-    let known: Vec<f64> = exposures.iter().copied().flatten().collect();
-    let mean = known.iter().sum::<f64>() / known.len().max(1) as f64;
+    let values: Vec<f64> = exposures.iter().copied().flatten().collect();
+    let mean = values.iter().sum::<f64>() / values.len().max(1) as f64;
     exposures.iter_mut().flatten().for_each(|exposure| *exposure -= mean);
 }
 

@@ -14,7 +14,7 @@ use serde::Serialize;
 
 mod fit;
 
-use self::fit::{ALL, ANGLE, LOG_LINEAR, NOTHING, Rows};
+use self::fit::{ALL, ANGLE, LOG_LINEAR, LampObservations, NOTHING};
 use super::geometry::Observation;
 
 /// A lamp is learned if it explains at least this fraction of the variance that exposures leave.
@@ -94,9 +94,9 @@ impl LampDiagnosis {
     }
 
     /// Measures the observations of points, by point, of this many views.
-    pub(super) fn of(points: &[Vec<Observation>], views: usize) -> Result<Self, String> {
-        let rows = Rows::of(points, views)?;
-        let left = Left::of(&rows);
+    pub(super) fn new(points: &[Vec<Observation>], views: usize) -> Result<Self, String> {
+        let rows = LampObservations::new(points, views)?;
+        let left = Left::new(&rows);
         let fit = rows.fit(ALL, true);
         let [exponent, k1, k2, ambient] = fit.coefficients;
         let stops = |more: f64, less: f64| (more - less).max(0.0).sqrt();
@@ -131,7 +131,7 @@ struct Left {
 }
 
 impl Left {
-    fn of(rows: &Rows) -> Self {
+    fn new(rows: &LampObservations) -> Self {
         let left = |terms, with_exposures| {
             let of_fold = |fold: usize| {
                 let fit = rows.part(|group| group % FOLDS != fold).fit(terms, with_exposures);

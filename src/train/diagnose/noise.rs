@@ -29,14 +29,14 @@ const MAX_ZEROS: f64 = 0.002;
 
 /// The noise of a channel in linear light; white is 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Noise {
+pub struct ChannelNoise {
     /// Variance per signal; for pure shot noise, 1 / the electrons of a white pixel.
     pub gain: f64,
     /// Standard deviation in the dark.
     pub read: f64,
 }
 
-impl Noise {
+impl ChannelNoise {
     /// The standard deviation at a signal, in linear light.
     pub fn deviation(&self, signal: f64) -> f64 {
         (self.gain * signal.max(0.0) + self.read * self.read).sqrt()
@@ -45,7 +45,7 @@ impl Noise {
 
 /// A small square of one channel.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Patch {
+pub(super) struct NoisePatch {
     /// Its mean, in linear light.
     signal: f64,
     /// The variance of its noise, if it is flat.
@@ -60,7 +60,7 @@ pub(super) struct Patch {
 
 /// The patches of a plane of linear values in rows of `width`; codes are `step` apart in encoded values. All patches if
 /// there are few, else an even selection.
-pub(super) fn patches(plane: &[f32], width: usize, step: f64) -> Vec<Patch> {
+pub(super) fn patches(plane: &[f32], width: usize, step: f64) -> Vec<NoisePatch> {
     const MOST: usize = 12_000;
     let (columns, rows) = (width / SIDE, plane.len() / width.max(1) / SIDE);
     let stride = (columns * rows).div_ceil(MOST).max(1);
@@ -74,7 +74,7 @@ pub(super) fn patches(plane: &[f32], width: usize, step: f64) -> Vec<Patch> {
     indices.map(patch).filter(|patch| patch.signal.is_finite()).collect()
 }
 
-fn patch(rows: [&[f32]; SIDE], step: f64) -> Patch {
+fn patch(rows: [&[f32]; SIDE], step: f64) -> NoisePatch {
     let values = || rows.iter().flat_map(|row| row.iter().map(|&value| f64::from(value)));
     let count = (SIDE * SIDE) as f64;
     let is_clipped = values().any(|value| value >= 1.0);
@@ -87,7 +87,7 @@ fn patch(rows: [&[f32]; SIDE], step: f64) -> Patch {
             squared_means += (f64::from(above[0] + above[1] + below[0] + below[1]) / 4.0).powi(2);
         }
     }
-    Patch {
+    NoisePatch {
         signal,
         variance: squares / (SIDE * (SIDE - 2)) as f64 / 6.0,
         texture: squared_means / (count / 4.0) - signal * signal,
@@ -107,12 +107,12 @@ pub(super) fn slope(linear: f64) -> f64 {
 }
 
 /// Fits the line to the flat patches; `None` if there are too few.
-pub(super) fn fit(mut patches: Vec<Patch>) -> Option<Noise> {
+pub(super) fn fit(mut patches: Vec<NoisePatch>) -> Option<ChannelNoise> {
     // A plane without quantisation has no dead patches.
     patches.retain(|patch| patch.variance >= DEAD * patch.quantization);
     patches.sort_unstable_by(|a, b| a.signal.total_cmp(&b.signal));
     let per_bin = patches.len().div_ceil(BINS).max((MIN_PATCHES as f64 / FLAT) as usize);
-    let mut bins: Vec<Bin> = patches.chunks_mut(per_bin).filter_map(Bin::of).collect();
+    let mut bins: Vec<Bin> = patches.chunks_mut(per_bin).filter_map(Bin::new).collect();
     // If noise is clipped in every bin, use what is left.
     if bins.iter().any(|bin| bin.zeros <= MAX_ZEROS) {
         bins.retain(|bin| bin.zeros <= MAX_ZEROS);
@@ -129,7 +129,7 @@ struct Bin {
 }
 
 impl Bin {
-    fn of(patches: &mut [Patch]) -> Option<Self> {
+    fn new(patches: &mut [NoisePatch]) -> Option<Self> {
         let zeros = patches.iter().map(|patch| patch.zeros).sum::<f64>() / patches.len() as f64;
         let flat = (patches.len() as f64 * FLAT) as usize;
         if flat < MIN_PATCHES {
@@ -137,7 +137,8 @@ impl Bin {
         }
         patches.sort_unstable_by(|a, b| a.texture.total_cmp(&b.texture));
         let flat = &patches[..flat];
-        let mean = |of: fn(&Patch) -> f64| flat.iter().map(of).sum::<f64>() / flat.len() as f64;
+        let mean =
+            |of: fn(&NoisePatch) -> f64| flat.iter().map(of).sum::<f64>() / flat.len() as f64;
         let variance = mean(|patch| patch.variance - patch.quantization);
         let count = flat.len() as f64;
         Some(Self { signal: mean(|patch| patch.signal), variance, count, zeros })
@@ -146,7 +147,7 @@ impl Bin {
 
 /// Least squares with non-negative coefficients. The error of a variance is proportional to it, so each bin is weighted
 /// by its patches over the square of the line's value.
-fn line(bins: &[Bin]) -> Noise {
+fn line(bins: &[Bin]) -> ChannelNoise {
     const ROUNDS: usize = 8;
     let mean = bins.iter().map(|bin| bin.variance.max(0.0)).sum::<f64>() / bins.len() as f64;
     let floor = (0.01 * mean).max(1e-18);
@@ -168,7 +169,7 @@ fn line(bins: &[Bin]) -> Noise {
             (gain, square) = (0.0, v / ones);
         }
     }
-    Noise { gain: gain.max(0.0), read: square.max(0.0).sqrt() }
+    ChannelNoise { gain: gain.max(0.0), read: square.max(0.0).sqrt() }
 }
 
 #[cfg(test)]
@@ -179,7 +180,7 @@ mod tests {
     const WIDTH: usize = 512;
 
     /// Stripes of brightness with noise, and texture in every second patch.
-    fn plane(noise: Noise, textured: bool) -> Vec<f32> {
+    fn plane(noise: ChannelNoise, textured: bool) -> Vec<f32> {
         let (width, height) = (WIDTH, 512);
         let stream = Stream::new(4, 0);
         let value = |index: usize| {
@@ -195,7 +196,7 @@ mod tests {
 
     #[test]
     fn gain_and_read_noise_are_found_in_textured_photographs() {
-        let injected = Noise { gain: 2e-4, read: 3e-3 };
+        let injected = ChannelNoise { gain: 2e-4, read: 3e-3 };
         for textured in [false, true] {
             let found = fit(patches(&plane(injected, textured), WIDTH, 0.0)).unwrap();
             assert!((found.gain / injected.gain - 1.0).abs() < 0.1, "{textured} {found:?}");
@@ -205,7 +206,7 @@ mod tests {
 
     #[test]
     fn a_clean_plane_has_no_noise_and_one_without_patches_no_estimate() {
-        let found = fit(patches(&plane(Noise::default(), true), WIDTH, 0.0)).unwrap();
+        let found = fit(patches(&plane(ChannelNoise::default(), true), WIDTH, 0.0)).unwrap();
         assert!(found.deviation(0.3) < 1e-4, "{found:?}");
         assert_eq!(fit(patches(&[0.5; 30], 6, 0.0)), None);
         assert_eq!(fit(vec![]), None);

@@ -1,6 +1,6 @@
 //! Measurements of one photograph, as stored: brightness, code values, noise, blur.
 
-use super::noise::{self, Noise, Patch};
+use super::noise::{self, ChannelNoise, NoisePatch};
 use super::sharpness;
 use super::target_noise::{TargetNoise, target_noise};
 use crate::photographs::image::{Image, Mask, linear_from_srgb};
@@ -24,8 +24,8 @@ pub(super) struct PhotographStatistics {
     pub(super) zero_fraction: f64,
     /// The number of different values, of 2^`bits`.
     pub(super) code_values: usize,
-    pub(super) noise: Option<Noise>,
-    pub(super) patches: Vec<Patch>,
+    pub(super) noise: Option<ChannelNoise>,
+    pub(super) patches: Vec<NoisePatch>,
     pub(super) blur: Option<f64>,
     /// The standard deviation of log2 linear luminance over large regions.
     pub(super) unevenness: f64,
@@ -35,10 +35,10 @@ pub(super) struct PhotographStatistics {
 
 impl PhotographStatistics {
     /// Measures the unmasked pixels of an image; noise and blur are those of the whole.
-    pub(super) fn of(image: &Image, mask: Option<&Mask>) -> Self {
+    pub(super) fn new(image: &Image, mask: Option<&Mask>) -> Self {
         let counted = mask.map(|mask| mask.counted(image));
         let counted = counted.as_deref().unwrap_or(&image.data);
-        let encoded = MeasuredPhotograph::of(counted);
+        let encoded = MeasuredPhotograph::measure(counted);
         let scene =
             SceneTone::from_photographs(&ToneSettings::default(), std::slice::from_ref(&encoded));
         let curve = scene.and_then(|scene| scene.inverse_of_scene().ok());
@@ -46,7 +46,7 @@ impl PhotographStatistics {
         let fraction = |is: fn(f32) -> bool| {
             counted.iter().filter(|&&value| is(value)).count() as f64 / values
         };
-        let linear = Linear::of(image);
+        let linear = Linear::new(image);
         let mut patches = vec![];
         for plane in linear.planes.chunks(image.pixel_count().max(1)) {
             patches.extend(noise::patches(plane, image.width as usize, linear.step));
@@ -65,7 +65,7 @@ impl PhotographStatistics {
             patches,
             blur: blur(image),
             unevenness: unevenness(&luminance, image.width as usize),
-            checksum: crate::base::hash::of(bytemuck::cast_slice(&image.data)),
+            checksum: crate::base::hash::checksum(bytemuck::cast_slice(&image.data)),
         }
     }
 }
@@ -78,7 +78,7 @@ struct Linear {
 }
 
 impl Linear {
-    fn of(image: &Image) -> Self {
+    fn new(image: &Image) -> Self {
         let levels = [255.0_f32, 65_535.0].into_iter().find(|&levels| {
             let is_whole = |&value: &f32| {
                 let code = value * levels;

@@ -93,7 +93,7 @@ pub struct PlannedViews {
 
 impl PlannedViews {
     /// Those of a dataset.
-    pub fn of(dataset: &Dataset) -> Self {
+    pub fn new(dataset: &Dataset) -> Self {
         let views: Vec<_> = dataset.views.iter().filter(|view| view.is_for_training()).collect();
         let line =
             |view: &&View| format!("{} {}x{}\n", view.name, view.camera.width, view.camera.height);
@@ -148,7 +148,7 @@ impl Plan {
         let sh_degree = sh_degree(scene, config);
         let curve = curve(scene);
         let follows_views = curve.on && !config.tone.scene_statistics;
-        let spread = Spread::of(scene, follows_views, diagnosis.views.len());
+        let spread = Spread::new(scene, follows_views, diagnosis.views.len());
         Self {
             left_out: diagnosis.black_views(),
             dataset: diagnosis.fingerprint.clone(),
@@ -167,26 +167,26 @@ impl Plan {
     /// The plan's decisions as settings.
     pub(in crate::train) fn layer(&self) -> Result<SettingsLayer> {
         let mut layer = SettingsLayer::default();
-        let mut say = |key: &str, value: Value| layer.push(key, value, Origin::Plan);
+        let mut set = |key: &str, value: Value| layer.push(key, value, Origin::Plan);
         if !self.curve.on {
-            say("tone.curve", ToneCurve::None.name().into())?;
+            set("tone.curve", ToneCurve::None.name().into())?;
         }
-        say("exposure.learn", self.exposure.on.into())?;
-        say("model.lamp", self.lamp.on.into())?;
+        set("exposure.learn", self.exposure.on.into())?;
+        set("model.lamp", self.lamp.on.into())?;
         if self.lamp.on {
-            say("lamp.exponent", self.lamp.exponent.into())?;
-            say("lamp.falloff", self.lamp.falloff[0].into())?;
-            say("lamp.falloff_squared", self.lamp.falloff[1].into())?;
-            say("lamp.ambient", self.lamp.ambient.into())?;
+            set("lamp.exponent", self.lamp.exponent.into())?;
+            set("lamp.falloff", self.lamp.falloff[0].into())?;
+            set("lamp.falloff_squared", self.lamp.falloff[1].into())?;
+            set("lamp.ambient", self.lamp.ambient.into())?;
         }
-        say("model.denoiser", self.denoiser.on.into())?;
-        say("model.tonemapper", self.tonemapper.on.into())?;
-        say("model.structure", self.structure.on.into())?;
-        say("model.depth", self.depth.on.into())?;
+        set("model.denoiser", self.denoiser.on.into())?;
+        set("model.tonemapper", self.tonemapper.on.into())?;
+        set("model.structure", self.structure.on.into())?;
+        set("model.depth", self.depth.on.into())?;
         for (key, number) in
             [("sh_degree", &self.sh_degree), ("max_gaussians", &self.max_gaussians)]
         {
-            say(key, i64::try_from(number.value).unwrap_or(i64::MAX).into())?;
+            set(key, i64::try_from(number.value).unwrap_or(i64::MAX).into())?;
         }
         Ok(layer)
     }
@@ -223,7 +223,7 @@ impl Plan {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
         let plan = Self::read(path)?;
-        let loaded = PlannedViews::of(dataset);
+        let loaded = PlannedViews::new(dataset);
         if plan.dataset != loaded {
             let (of, is) = (plan.dataset.described(), loaded.described());
             let problem = format!(
@@ -269,7 +269,7 @@ struct Spread {
 
 impl Spread {
     /// A curve that follows each view compensates most of the photographs' spread.
-    fn of(scene: &SceneDiagnosis, follows_views: bool, views: usize) -> Self {
+    fn new(scene: &SceneDiagnosis, follows_views: bool, views: usize) -> Self {
         let SceneDiagnosis { exposure_share: share, spread_is_measured, .. } = *scene;
         // With a lamp, all views have one curve, and what it explains is not the exposures'.
         let beside_lamp = scene.lamp.as_ref().filter(|lamp| lamp.is_found());

@@ -54,9 +54,9 @@ fn blurred(plane: &[f32], width: usize, sigma: f64) -> Vec<f32> {
     let sum: f32 = kernel.iter().sum();
     kernel.iter_mut().for_each(|weight| *weight /= sum);
     let height = plane.len() / width;
-    let along = |source: &[f32], step: usize, last: usize, place: fn(usize, usize) -> usize| {
+    let along = |source: &[f32], step: usize, last: usize, position: fn(usize, usize) -> usize| {
         let value = |index: usize| {
-            let here = place(index, width) as isize;
+            let here = position(index, width) as isize;
             let taps = kernel.iter().zip(-reach..);
             let tap = |(weight, x): (&f32, isize)| {
                 let there = (here + x).clamp(0, last as isize - 1);

@@ -43,13 +43,15 @@ pub(super) fn target_noise(image: &Image, curve: &InverseTone) -> Option<TargetN
     let (columns, rows) = (image.width / SIDE, image.height / SIDE);
     let step = (columns * rows).div_ceil(MOST).max(1) as usize;
     let indices = (0..columns * rows).step_by(step);
-    let mut patches: Vec<Patch> = indices
-        .map(|index| Patch::of(image, [index % columns * SIDE, index / columns * SIDE], curve))
+    let mut patches: Vec<TargetPatch> = indices
+        .map(|index| {
+            TargetPatch::new(image, [index % columns * SIDE, index / columns * SIDE], curve)
+        })
         .collect();
     patches.sort_unstable_by(|a, b| a.brightness.total_cmp(&b.brightness));
     let quarter = patches.len() / 4;
     let middle = &patches[quarter..patches.len() - quarter];
-    let deviation = |of: fn(&Patch) -> f64, part: f64| {
+    let deviation = |of: fn(&TargetPatch) -> f64, part: f64| {
         let mut variances: Vec<f64> = middle.iter().map(of).collect();
         variances.sort_unstable_by(f64::total_cmp);
         variances.get((variances.len() as f64 * part) as usize).map(|variance| variance.sqrt())
@@ -62,15 +64,15 @@ pub(super) fn target_noise(image: &Image, curve: &InverseTone) -> Option<TargetN
 }
 
 /// A square of a target.
-struct Patch {
+struct TargetPatch {
     brightness: f64,
     /// Variances about the fitted planes.
     luma: f64,
     chroma: f64,
 }
 
-impl Patch {
-    fn of(image: &Image, [left, top]: [u32; 2], curve: &InverseTone) -> Self {
+impl TargetPatch {
+    fn new(image: &Image, [left, top]: [u32; 2], curve: &InverseTone) -> Self {
         let side = SIDE / STRIDE;
         let mut values = [const { Vec::new() }; 3];
         for y in 0..side {
@@ -125,7 +127,7 @@ mod tests {
     }
 
     fn scene(image: &Image) -> SceneTone {
-        let measured = MeasuredPhotograph::of(&image.data);
+        let measured = MeasuredPhotograph::measure(&image.data);
         SceneTone::from_photographs(&ToneSettings::default(), &[measured]).unwrap()
     }
 

@@ -69,9 +69,9 @@ fn mean(x: f32, y: f32, z: f32) -> Result<Hostile> {
 }
 
 /// Trains one step, in which Adam moves the Gaussian out of the view.
-fn at_once(mut own: Hostile) -> Hostile {
-    own.config.steps = 1;
-    own
+fn at_once(mut hostile: Hostile) -> Hostile {
+    hostile.config.steps = 1;
+    hostile
 }
 
 /// Every hostile Gaussian of the table in front of one camera.
@@ -116,14 +116,14 @@ fn coincident(count: usize) -> Result<Hostile> {
 
 /// Many faint Gaussians on one pixel of an image of one tile, in a row along the axis.
 fn splats_per_tile(count: usize) -> Result<Hostile> {
-    let mut own = Hostile::gaussians(count, [16, 8], |gaussians, i| {
+    let mut hostile = Hostile::gaussians(count, [16, 8], |gaussians, i| {
         let depth = 1.0 + 4.0 * i as f32 / 100_000.0;
         gaussians.means_mut()[i] = Vec3::new(0.0, 0.0, depth);
         gaussians.log_scales_mut()[i] = Vec3::splat((0.1 * depth / 14.4).ln());
         gaussians.raw_opacities_mut()[i] = -4.5;
     });
-    own.config.steps = 1;
-    Ok(own)
+    hostile.config.steps = 1;
+    Ok(hostile)
 }
 
 fn focal(focal: f64) -> Result<Hostile> {
@@ -138,11 +138,11 @@ fn size(width: u32, height: u32) -> Result<Hostile> {
 
 /// One that covers a view of more than ten thousand tiles.
 fn wide() -> Result<Hostile> {
-    let mut own = Hostile::gaussians(1, [1920, 1080], |gaussians, i| {
+    let mut hostile = Hostile::gaussians(1, [1920, 1080], |gaussians, i| {
         gaussians.log_scales_mut()[i] = Vec3::splat(3.0);
     });
-    own.config.steps = 1;
-    Ok(own)
+    hostile.config.steps = 1;
+    Ok(hostile)
 }
 
 /// A square view of 8192 pixels, or the largest that the device can train on.
@@ -154,10 +154,10 @@ fn largest(gpu: &Gpu) -> Result<Hostile> {
         let middle = (low + high) / 2;
         *(if fits(middle) { &mut low } else { &mut high }) = middle;
     }
-    let mut own = Hostile::gaussians(1, [low; 2], |_, _| ());
-    own.config.steps = 1;
-    own.config.tile = Some(settings.tile_for(gpu, std::iter::once([low; 2]))?);
-    Ok(own)
+    let mut hostile = Hostile::gaussians(1, [low; 2], |_, _| ());
+    hostile.config.steps = 1;
+    hostile.config.tile = Some(settings.tile_for(gpu, std::iter::once([low; 2]))?);
+    Ok(hostile)
 }
 
 /// A refusal, or else the step is done.
@@ -172,9 +172,9 @@ fn sh(dc: f32, rest: f32) -> Result<Hostile> {
         if dc > 0.0 {
             gaussians.dc_mut()[i] = Vec3::splat(dc);
         }
-        for (k, own) in (0..15).zip(gaussians.rest_mut()) {
+        for (k, coefficient) in (0..15).zip(gaussians.rest_mut()) {
             let draw = |c: u64| rest * stream.normal(3 * k + c) as f32;
-            *own = Vec3::from_array([0, 1, 2].map(draw));
+            *coefficient = Vec3::from_array([0, 1, 2].map(draw));
         }
     }))
 }
@@ -278,10 +278,10 @@ pub(super) const CASES: &[Case] = &[
         |_| splats_per_tile(100_000),
     )),
     quick(case("no Gaussian", "black", Trains, |_| {
-        size(32, 24).map(|mut own| {
-            own.gaussians = Some(Gaussians::zeros(0, 3));
-            own.concerned = 0..0;
-            own
+        size(32, 24).map(|mut hostile| {
+            hostile.gaussians = Some(Gaussians::zeros(0, 3));
+            hostile.concerned = 0..0;
+            hostile
         })
     })),
     case("one Gaussian", "learns", Learns, |_| Ok(Hostile::alone(SIZE))),
@@ -309,9 +309,9 @@ pub(super) const CASES: &[Case] = &[
         Ok(Hostile::photograph(|_, _| [0.0; 3]))
     })),
     case("photograph black, curve auto", "refused: all black", Refusal("almost black"), |_| {
-        let mut own = Hostile::photograph(|_, _| [0.0; 3]);
-        own.config.tone = ToneSettings::default();
-        Ok(own)
+        let mut hostile = Hostile::photograph(|_, _| [0.0; 3]);
+        hostile.config.tone = ToneSettings::default();
+        Ok(hostile)
     }),
     case("photograph of one value: p10 = p90", "trains", Trains, |_| {
         Ok(Hostile::photograph(|_, _| [0.05; 3]))

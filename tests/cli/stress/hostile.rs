@@ -108,9 +108,9 @@ impl Hostile {
 
     /// No hostile Gaussian, but a photograph.
     pub(super) fn photograph(color: impl Fn(u32, u32) -> [f32; 3]) -> Self {
-        let mut own = Self::gaussians(1, [32, 24], |_, _| ());
-        own.dataset.views[0].image = Some(Image::from_fn(32, 24, color));
-        own
+        let mut hostile = Self::gaussians(1, [32, 24], |_, _| ());
+        hostile.dataset.views[0].image = Some(Image::from_fn(32, 24, color));
+        hostile
     }
 
     /// Photographs in EXR files, read by the loader; `value` of linear light, column and row. The first Gaussians are

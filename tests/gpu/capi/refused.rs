@@ -62,11 +62,11 @@ fn structs_grow_by_zeros() {
     #[repr(C)]
     #[derive(Clone, Copy)]
     struct Later {
-        own: NspHostDevice,
+        current: NspHostDevice,
         more: [u64; 2],
     }
-    let mut later = Later { own: good, more: [0; 2] };
-    later.own.struct_size = size_of::<Later>();
+    let mut later = Later { current: good, more: [0; 2] };
+    later.current.struct_size = size_of::<Later>();
     let mut device = null_mut();
     // SAFETY: the struct is as long as it says.
     unsafe {
@@ -103,44 +103,52 @@ fn every_bad_render_is_refused_by_code_and_name_and_nothing_is_recorded() {
             &["NspRender is NULL"],
         );
     }
-    refuse(&|own| own.struct_size = 0, NSP_ERROR_USAGE, &["NspRender::struct_size"]);
-    refuse(&|own| own.commands = vk::CommandBuffer::null(), NSP_ERROR_USAGE, &["::commands"]);
-    refuse(&|own| own.cameras = null(), NSP_ERROR_USAGE, &["::cameras"]);
-    refuse(&|own| own.camera_count = 0, NSP_ERROR_USAGE, &["::cameras"]);
-    refuse(&|own| own.flags = 1 << 20, NSP_ERROR_USAGE, &["::flags", "0x100000"]);
+    refuse(&|changed| changed.struct_size = 0, NSP_ERROR_USAGE, &["NspRender::struct_size"]);
     refuse(
-        &|own| own.flags = NSP_RENDER_PHOTOGRAPH,
+        &|changed| changed.commands = vk::CommandBuffer::null(),
+        NSP_ERROR_USAGE,
+        &["::commands"],
+    );
+    refuse(&|changed| changed.cameras = null(), NSP_ERROR_USAGE, &["::cameras"]);
+    refuse(&|changed| changed.camera_count = 0, NSP_ERROR_USAGE, &["::cameras"]);
+    refuse(&|changed| changed.flags = 1 << 20, NSP_ERROR_USAGE, &["::flags", "0x100000"]);
+    refuse(
+        &|changed| changed.flags = NSP_RENDER_PHOTOGRAPH,
         NSP_ERROR_USAGE,
         &["states no tone law", "named tone curve"],
     );
-    refuse(&|own| own.color = null(), NSP_ERROR_USAGE, &["no target"]);
-    refuse(&|own| own.exposure = f32::INFINITY, NSP_ERROR_USAGE, &["exposure"]);
+    refuse(&|changed| changed.color = null(), NSP_ERROR_USAGE, &["no target"]);
+    refuse(&|changed| changed.exposure = f32::INFINITY, NSP_ERROR_USAGE, &["exposure"]);
     let with = |change: &dyn Fn(&mut NspImage), code, words: &[&str]| {
         let mut image = color;
         change(&mut image);
-        refuse(&|own| own.color = &image, code, words);
+        refuse(&|changed| changed.color = &image, code, words);
     };
-    with(&|own| own.image = vk::Image::null(), NSP_ERROR_USAGE, &["color", "null"]);
-    with(&|own| own.format = vk::Format::R8_UNORM, NSP_ERROR_USAGE, &["::color", "RGBA16F"]);
-    with(&|own| own.extent.width = 10, NSP_ERROR_USAGE, &["color", "10x240", "320x240"]);
-    refuse(&|own| own.depth_out = &color, NSP_ERROR_USAGE, &["depth", "R32Float"]);
-    refuse(&|own| own.scene_depth = &color, NSP_ERROR_USAGE, &["scene depth"]);
+    with(&|changed| changed.image = vk::Image::null(), NSP_ERROR_USAGE, &["color", "null"]);
+    with(
+        &|changed| changed.format = vk::Format::R8_UNORM,
+        NSP_ERROR_USAGE,
+        &["::color", "RGBA16F"],
+    );
+    with(&|changed| changed.extent.width = 10, NSP_ERROR_USAGE, &["color", "10x240", "320x240"]);
+    refuse(&|changed| changed.depth_out = &color, NSP_ERROR_USAGE, &["depth", "R32Float"]);
+    refuse(&|changed| changed.scene_depth = &color, NSP_ERROR_USAGE, &["scene depth"]);
     let with = |change: &dyn Fn(&mut NspCamera), words: &[&str]| {
         let mut other = camera;
         change(&mut other);
-        refuse(&|own| own.cameras = &other, NSP_ERROR_USAGE, words);
+        refuse(&|changed| changed.cameras = &other, NSP_ERROR_USAGE, words);
     };
-    with(&|own| own.width = 0, &["camera 0", "0x240"]);
-    with(&|own| own.focal[1] = 0.0, &["focal"]);
-    with(&|own| own.view_from_world[3] = f64::NAN, &["not finite"]);
-    with(&|own| own.view_from_world[0] = 1.1, &["not rigid"]);
+    with(&|changed| changed.width = 0, &["camera 0", "0x240"]);
+    with(&|changed| changed.focal[1] = 0.0, &["focal"]);
+    with(&|changed| changed.view_from_world[3] = f64::NAN, &["not finite"]);
+    with(&|changed| changed.view_from_world[0] = 1.1, &["not rigid"]);
     // A view beyond what the device follows names the longest side it takes.
-    with(&|own| (own.width, own.height) = (1 << 20, 1 << 20), &["color"]);
+    with(&|changed| (changed.width, changed.height) = (1 << 20, 1 << 20), &["color"]);
 
     // Nothing was recorded: the frame's number has not moved either.
     // SAFETY: everything is valid.
     ok(unsafe { nsp_record_render(renderer, model, &NspRender { frame: 4, ..good }) });
-    refuse(&|own| own.frame = 3, NSP_ERROR_USAGE, &["frame 3", "frame 4"]);
+    refuse(&|changed| changed.frame = 3, NSP_ERROR_USAGE, &["frame 3", "frame 4"]);
     session.host.submit_frame(commands, 4);
     session.host.wait_frame(4);
     assert_close(&session.pixels(), &own_render(&Model::from(gaussians(2))));
@@ -280,12 +288,12 @@ unsafe extern "C" fn allocate(
 ) -> vk::Result {
     // SAFETY: as the library promises.
     unsafe {
-        let own = &*user.cast::<HostMemory>();
+        let host = &*user.cast::<HostMemory>();
         assert!(!CStr::from_ptr(name).to_bytes().is_empty());
-        match own.wrong.load(Ordering::Acquire) {
+        match host.wrong.load(Ordering::Acquire) {
             1 => return vk::Result::ERROR_OUT_OF_DEVICE_MEMORY,
             2 => {
-                own.out.fetch_add(1, Ordering::AcqRel);
+                host.out.fetch_add(1, Ordering::AcqRel);
                 (*out).offset = 3;
                 return vk::Result::SUCCESS;
             }
@@ -296,10 +304,10 @@ unsafe extern "C" fn allocate(
         let info = vk::MemoryAllocateInfo::default()
             .allocation_size(needed.size)
             .memory_type_index(needed.memory_type_bits.trailing_zeros());
-        let memory = own.device.allocate_memory(&info, None).unwrap();
-        let mapped = own.device.map_memory(memory, 0, vk::WHOLE_SIZE, Default::default());
+        let memory = host.device.allocate_memory(&info, None).unwrap();
+        let mapped = host.device.map_memory(memory, 0, vk::WHOLE_SIZE, Default::default());
         *out = NspMemory { memory, offset: 0, mapped: mapped.unwrap(), cookie: null_mut() };
-        own.out.fetch_add(1, Ordering::AcqRel);
+        host.out.fetch_add(1, Ordering::AcqRel);
         vk::Result::SUCCESS
     }
 }
@@ -307,12 +315,12 @@ unsafe extern "C" fn allocate(
 unsafe extern "C" fn free(user: *mut c_void, memory: *const NspMemory) {
     // SAFETY: as the library promises.
     unsafe {
-        let own = &*user.cast::<HostMemory>();
+        let host = &*user.cast::<HostMemory>();
         if (*memory).memory != vk::DeviceMemory::null() {
-            own.device.free_memory((*memory).memory, None);
-            own.out.fetch_sub(1, Ordering::AcqRel);
-        } else if own.wrong.load(Ordering::Acquire) == 2 {
-            own.out.fetch_sub(1, Ordering::AcqRel);
+            host.device.free_memory((*memory).memory, None);
+            host.out.fetch_sub(1, Ordering::AcqRel);
+        } else if host.wrong.load(Ordering::Acquire) == 2 {
+            host.out.fetch_sub(1, Ordering::AcqRel);
         }
     }
 }
@@ -322,7 +330,7 @@ fn the_hosts_allocator_gives_all_memory_and_gets_it_back() {
     if !gpu().properties().is_cpu {
         return not_run("lavapipe", "the host's allocator needs memory types that are all mapped");
     }
-    let own = OnceLock::new();
+    let host_memory = OnceLock::new();
     let mut functions =
         NspMemoryFunctions { allocate: Some(allocate), free: Some(free), user: null_mut() };
     let mut session = Session::new(|lent| {
@@ -334,30 +342,30 @@ fn the_hosts_allocator_gives_all_memory_and_gets_it_back() {
             ash::Device::load(instance.fp_v1_0(), lent.device)
         };
         let memory = HostMemory { device, out: AtomicU64::new(0), wrong: AtomicU64::new(0) };
-        functions.user = (&raw const *own.get_or_init(|| memory)).cast_mut().cast();
+        functions.user = (&raw const *host_memory.get_or_init(|| memory)).cast_mut().cast();
         lent.device_memory = &functions;
     });
-    let own = own.get().unwrap();
+    let host_memory = host_memory.get().unwrap();
     session.prepare();
     session.assert_draws(1, &Model::from(gaussians(2)));
-    let out = own.out.load(Ordering::Acquire);
+    let out = host_memory.out.load(Ordering::Acquire);
     assert!(out > 20, "{out}");
     let mut model = null_mut();
     for (wrong, code, words) in
         [(1, NSP_ERROR_MEMORY, "ERROR_OUT_OF_DEVICE_MEMORY"), (2, NSP_ERROR_INTERNAL, "offset 3")]
     {
-        own.wrong.store(wrong, Ordering::Release);
+        host_memory.wrong.store(wrong, Ordering::Release);
         let device = session.device;
         // SAFETY: valid.
         let result = unsafe { nsp_model_load(device, session.path().as_ptr(), &mut model) };
         refused(result, code, &["nsp_model_load", words]);
-        assert_eq!(own.out.load(Ordering::Acquire), out);
+        assert_eq!(host_memory.out.load(Ordering::Acquire), out);
     }
-    own.wrong.store(0, Ordering::Release);
+    host_memory.wrong.store(0, Ordering::Release);
     session.clear();
     // SAFETY: every frame is done.
     ok(unsafe { nsp_frames_done(session.device, u64::MAX) });
-    assert_eq!(own.out.load(Ordering::Acquire), 0);
+    assert_eq!(host_memory.out.load(Ordering::Acquire), 0);
     session.end();
 }
 
@@ -454,8 +462,9 @@ fn objects_come_from_the_hosts_callbacks_and_its_pipeline_cache_stays_its_own() 
             let get = lent.get_instance_proc_addr.unwrap();
             let get = ash::StaticFn { get_instance_proc_addr: get };
             let instance = ash::Instance::load(&get, lent.instance);
-            let own = device.get_or_init(|| ash::Device::load(instance.fp_v1_0(), lent.device));
-            lent.pipeline_cache = own.create_pipeline_cache(&info, None).unwrap();
+            let lent_device =
+                device.get_or_init(|| ash::Device::load(instance.fp_v1_0(), lent.device));
+            lent.pipeline_cache = lent_device.create_pipeline_cache(&info, None).unwrap();
         }
         cache.set(lent.pipeline_cache).unwrap();
     });

@@ -12,12 +12,12 @@ pub(super) unsafe extern "C" fn lock_queue(_: *mut c_void, _: vk::Queue) {
     let guard = QUEUE.lock().unwrap();
     assert!(!HELD.swap(true, Ordering::AcqRel), "the lock is held twice");
     LOCKED.fetch_add(1, Ordering::AcqRel);
-    GUARD.with_borrow_mut(|own| *own = Some(guard));
+    GUARD.with_borrow_mut(|held| *held = Some(guard));
 }
 
 unsafe extern "C" fn unlock_queue(_: *mut c_void, _: vk::Queue) {
     HELD.store(false, Ordering::Release);
-    GUARD.with_borrow_mut(|own| *own = None);
+    GUARD.with_borrow_mut(|held| *held = None);
 }
 
 #[test]

@@ -12,7 +12,7 @@ fn a_view_beyond_the_memory_is_never_blank_and_soon_exact() {
         let layout = shown.on_device.layout;
         shown.renderer.prepare_draw(&layout, &cameras(), &target).unwrap();
         shown.renderer.set_intersection_capacity(200).unwrap();
-        let own = expected(&cameras()[0], pixels::PIXELS_UNORM, 0, None);
+        let exact = expected(&cameras()[0], pixels::PIXELS_UNORM, 0, None);
         assert!(shown.renderer.drawn().is_none());
         for frame in 1..=3 {
             draw(&mut shown, frame, &target);
@@ -24,7 +24,7 @@ fn a_view_beyond_the_memory_is_never_blank_and_soon_exact() {
                 assert!(pixels.iter().any(|pixel| pixel >> 24 > 100), "blank");
             } else {
                 assert_eq!(drawn.left_out(), 0, "{drawn:?}");
-                assert!(levels(&pixels, &own, false) <= 1);
+                assert!(levels(&pixels, &exact, false) <= 1);
             }
         }
         // A budget leaves out the farthest whatever the memory.
@@ -65,7 +65,7 @@ fn with_frames_in_flight_everything_may_grow_and_go() {
         host.wait_frame(24);
         gpu.frames_done(24);
         assert_eq!(gpu.memory_in_use(), 0, "of {used:?}");
-        pictures.into_iter().for_each(|own| host.free_picture(own));
+        pictures.into_iter().for_each(|picture| host.free_picture(picture));
     });
 }
 

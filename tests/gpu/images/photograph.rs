@@ -9,15 +9,15 @@ use super::*;
 
 /// The parameters of `auto` for dark photographs, with this share of kept colours.
 fn parameters(share: f32, weight: f32) -> ToneParameters {
-    let mut own =
+    let mut of_curve =
         ToneParameters { white: 0.15, offset: 0.075, gain: 1.0, weight, ..Default::default() };
-    own.constants[0] = share;
-    own
+    of_curve.constants[0] = share;
+    of_curve
 }
 
 /// The law of dark photographs.
 pub(crate) fn law() -> SceneLaw {
-    SceneLaw::of(&ToneSettings::new(Tone::Auto), &parameters(1.0 / 3.0, 1.0)).unwrap()
+    SceneLaw::new(&ToneSettings::new(Tone::Auto), &parameters(1.0 / 3.0, 1.0)).unwrap()
 }
 
 /// Black, the black level, no number, beyond white, clipped, and everything between in all three channels.
@@ -60,12 +60,12 @@ fn the_light_of_auto_is_the_hosts_inverse_to_a_ten_thousandth_up_to_clipping() {
         let (settings, tone) = (ToneSettings::new(Tone::Auto), parameters(share, weight));
         let inverse = InverseTone::new(&settings, &tone).unwrap();
         let mut most = 0.0_f64;
-        for (target, own) in targets.iter().zip(inverted(Tone::Auto.constant(), tone, &targets)) {
-            let expected = inverse.of(target.map(f64::from));
-            for (own, expected) in own.into_iter().zip(expected.rgb) {
-                assert!(own.is_finite());
+        for (target, found) in targets.iter().zip(inverted(Tone::Auto.constant(), tone, &targets)) {
+            let expected = inverse.invert(target.map(f64::from));
+            for (found, expected) in found.into_iter().zip(expected.rgb) {
+                assert!(found.is_finite());
                 // A code of 16 bits of the photograph, where its target is all but black.
-                let off = ((own - expected).abs() - 1.0 / 65_535.0).max(0.0) / expected.max(1e-9);
+                let off = ((found - expected).abs() - 1.0 / 65_535.0).max(0.0) / expected.max(1e-9);
                 most = most.max(off);
             }
         }
@@ -86,8 +86,8 @@ fn the_light_of_every_curve_that_rises_agrees_with_the_hosts_inverse() {
             weight: 1.0,
             ..Default::default()
         };
-        for (own, given) in parameters.constants.iter_mut().zip(family.defaults()) {
-            *own = given as f32;
+        for (constant, given) in parameters.constants.iter_mut().zip(family.defaults()) {
+            *constant = given as f32;
         }
         if family.curve == ToneCurve::PerChannel {
             parameters.constants[..3].copy_from_slice(&[0.1, 0.2, 0.4]);
@@ -136,8 +136,10 @@ fn every_colour_format_gets_the_photographs_light_and_else_costs_nothing() {
                     let (mut render, transmittances) = planes(camera);
                     in_photographs(&law, &mut render, &transmittances);
                     let under = is_over.then_some(&under[..]);
-                    let own = packed((&render, &transmittances), encoding, swaps, under);
-                    let off = levels(pixels, &own, encoding == pixels::PIXELS_LINEAR_HALF);
+                    let packed_expected =
+                        packed((&render, &transmittances), encoding, swaps, under);
+                    let off =
+                        levels(pixels, &packed_expected, encoding == pixels::PIXELS_LINEAR_HALF);
                     assert!(off <= 1, "{format:?}: {off} levels");
                 }
                 host.free_picture(picture);
@@ -153,7 +155,7 @@ fn in_photographs(law: &SceneLaw, render: &mut [f32], transmittances: &[f32]) {
         let alpha = 1.0 - f64::from(*transmittance);
         if alpha > 0.0 {
             let target = [0, 1, 2].map(|c| f64::from(render[c * PIXELS + at]) / alpha);
-            let back = inverse.of(target).rgb;
+            let back = inverse.invert(target).rgb;
             (0..3).for_each(|c| render[c * PIXELS + at] = (back[c] * alpha) as f32);
         }
     }

@@ -86,15 +86,15 @@ fn one_grey_card_balances_every_photograph_cached_or_not() {
         Dataset::load(root, &LoadOptions { white_balance, keep, ..LoadOptions::default() }).unwrap()
     };
     let (stored, kept) = (load(root), balanced(None, "v03,2,2,5,5"));
-    for (own, stored) in kept.views.iter().zip(&stored.views) {
-        let [red, green, blue] = pixel(own);
-        assert!((red - green).abs() < 1e-4 && (blue - green).abs() < 1e-4, "{}", own.name);
-        assert_eq!(own.reference, stored.reference);
+    for (view, stored) in kept.views.iter().zip(&stored.views) {
+        let [red, green, blue] = pixel(view);
+        assert!((red - green).abs() < 1e-4 && (blue - green).abs() < 1e-4, "{}", view.name);
+        assert_eq!(view.reference, stored.reference);
     }
     let anew = balanced(Some(0), "v03.png,2,2,5,5");
-    for (own, kept) in anew.views.iter().zip(&kept.views) {
-        assert!(own.image.is_none());
-        assert_eq!(*own.loaded().unwrap().unwrap(), *kept.loaded().unwrap().unwrap());
+    for (view, kept) in anew.views.iter().zip(&kept.views) {
+        assert!(view.image.is_none());
+        assert_eq!(*view.loaded().unwrap().unwrap(), *kept.loaded().unwrap().unwrap());
     }
     let same = balanced(None, "1,1,1");
     assert!(same.views.iter().zip(&stored.views).all(|(a, b)| a.image == b.image));

@@ -37,7 +37,7 @@ fn expected() -> Vec<DVec3> {
 
 #[test]
 fn points_of_a_ply_are_read_from_the_listed_or_usual_place() {
-    for (place, key) in [
+    for (file, key) in [
         ("clouds/mine.ply", Some("./clouds/mine.ply")),
         ("mine.ply", Some("C:\\scan\\mine.ply")),
         ("points3d.ply", None),
@@ -48,8 +48,8 @@ fn points_of_a_ply_are_read_from_the_listed_or_usual_place() {
                 listing["ply_file_path"] = json!(key);
             }
         });
-        write_points(&folder.join(place), &POINTS);
-        assert_eq!(positions(&load(&folder)), expected(), "{place}");
+        write_points(&folder.join(file), &POINTS);
+        assert_eq!(positions(&load(&folder)), expected(), "{file}");
     }
     let folder = Folder::with_text_model(&model(9));
     fs::remove_file(folder.join("sparse/0/points3D.txt")).unwrap();
@@ -240,9 +240,9 @@ fn scaled_rounded_and_transposed_matrices_are_read_with_a_remark() {
     let dataset = load(&folder);
     assert_eq!(dataset.views.len(), 9);
     for (index, view) in dataset.views.iter().enumerate() {
-        let own = view.camera.view_from_world;
-        assert!(own.abs_diff_eq(pose(index), 5e-3));
-        let rotation = own.matrix3.transpose() * own.matrix3;
+        let view_from_world = view.camera.view_from_world;
+        assert!(view_from_world.abs_diff_eq(pose(index), 5e-3));
+        let rotation = view_from_world.matrix3.transpose() * view_from_world.matrix3;
         assert!(rotation.abs_diff_eq(DMat3::IDENTITY, 1e-9));
     }
 }

@@ -50,8 +50,8 @@ fn a_model_and_its_photographs_are_found_in_the_folders_of_tools() {
 fn a_path_of_a_model_or_listing_names_its_dataset() {
     let folder = Folder::empty();
     photographs(&folder, "images", 0..9, 1.0);
-    for place in ["sparse/0", "sparse/1"] {
-        model(9).write_binary(&folder.join(place));
+    for folder_of_model in ["sparse/0", "sparse/1"] {
+        model(9).write_binary(&folder.join(folder_of_model));
     }
     // One camera of the other model is elsewhere.
     let mut other = model(9);
@@ -327,7 +327,7 @@ fn black_borders_of_undistorted_photographs_are_masked_but_not_those_of_a_dark_s
     let options = LoadOptions::default();
     let (dataset, loaded) = Diagnosis::load(&folder, &options).unwrap();
     assert!(loaded.views[0].zero_fraction == 0.0, "{}", loaded.views[0].zero_fraction);
-    assert_eq!(Diagnosis::of(&dataset, &options).unwrap(), loaded);
+    assert_eq!(Diagnosis::new(&dataset, &options).unwrap(), loaded);
     {
         let apply = format!("tone apply {} --curve ap3 --json", folder.display());
         let (report, _) = crate::common::command::run(&apply, 0);

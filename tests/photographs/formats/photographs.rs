@@ -176,11 +176,11 @@ fn a_photograph_is_rotated_if_its_camera_is_upright_and_else_kept_as_stored() {
                 assert_eq!(columns, [false, true], "orientation {orientation} is turned");
             }
             let lone = root.join("images/v03.jpg");
-            let stated = Orientation::of(&lone);
+            let stated = Orientation::from_file(&lone);
             let left = if is_turned { Orientation::UPRIGHT } else { stated };
             assert_eq!(view(&dataset, "v03").orientation, left);
-            let upright = Image::load(&lone).unwrap().turned(Orientation::of(&lone));
-            assert_eq!((upright.width, upright.height), Orientation::of(&lone).size(stored));
+            let upright = Image::load(&lone).unwrap().turned(Orientation::from_file(&lone));
+            assert_eq!((upright.width, upright.height), Orientation::from_file(&lone).size(stored));
         }
         jpeg(&root.join("images/v03.jpg"), (36, 40), orientation);
         let upright = if orientation >= 5 { " (upright 40x36)" } else { "" };

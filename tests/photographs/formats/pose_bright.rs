@@ -68,9 +68,9 @@ fn the_dark_and_the_bright_photographs_get_a_dataset_each_in_the_same_coordinate
         assert!(dataset.skipped.is_empty(), "{:?}", dataset.skipped);
         for view in &dataset.views {
             let file = format!("{}.png", view.name);
-            let [own, kept] =
+            let [posed, kept] =
                 [source, &set.join("images")].map(|at| fs::read(at.join(&file)).unwrap());
-            assert_eq!(own, kept, "{file}");
+            assert_eq!(posed, kept, "{file}");
             let index = view.name[1..].parse::<usize>().unwrap();
             let id = if count == 3 { index + 5 } else { index } as u32 + 7;
             let pose = whole.images.iter().find(|image| image.0 == id).unwrap().1;
@@ -129,7 +129,7 @@ fn colmap_poses_dark_photographs_through_bright_ones_of_other_views() {
         }
     }
     let mean =
-        |at: usize| distances.iter().map(|own| own[at]).sum::<f64>() / distances.len() as f64;
+        |at: usize| distances.iter().map(|pair| pair[at]).sum::<f64>() / distances.len() as f64;
     let (scale, extent) = (mean(0) / mean(1), mean(1));
     let off = distances.iter().map(|[found, truth]| (found / scale - truth).abs() / extent);
     let mut off: Vec<f64> = off.collect();

@@ -181,13 +181,13 @@ fn light_on_the_sensor_comes_back_in_an_exr_through_target_and_inverse() {
     let [raw, exr] = ["a.dng", "a.exr"].map(|name| folder.join(name));
     // Seven stops, in colours.
     let light = |x: u16, y: u16| {
-        let own = 0.03 / f32::from(1_u16 << (x / 4));
-        [own, 0.7 * own, if y < 4 { 0.4 * own } else { own }]
+        let red = 0.03 / f32::from(1_u16 << (x / 4));
+        [red, 0.7 * red, if y < 4 { 0.4 * red } else { red }]
     };
     fs::write(&raw, dng(28, 8, |x, y| counted(light(x, y)))).unwrap();
     let photograph = Image::load(&raw).unwrap();
     let settings = ToneSettings::default();
-    let measured = MeasuredPhotograph::of(&photograph.data);
+    let measured = MeasuredPhotograph::measure(&photograph.data);
     let scene = SceneTone::from_photographs(&settings, std::slice::from_ref(&measured)).unwrap();
     let mapping = scene.mapping_of(&measured);
     let pseudo_gt = PseudoGt::new(&gpu(), &settings).unwrap();
@@ -195,7 +195,7 @@ fn light_on_the_sensor_comes_back_in_an_exr_through_target_and_inverse() {
     assert!(target.pixel(9, 2)[0] > 2.0 * photograph.pixel(9, 2)[0], "the target is brighter");
     let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
     let back = Image::from_fn(28, 8, |x, y| {
-        let found = inverse.of(target.pixel(x, y).map(f64::from));
+        let found = inverse.invert(target.pixel(x, y).map(f64::from));
         assert!(!found.is_clipped, "{x} {y}");
         found.rgb.map(|x| x as f32)
     });

@@ -27,8 +27,8 @@ const QUARTER_TURN: (u8, u8) = (6, 8);
 fn points() -> Vec<(DVec3, u8)> {
     let part = |index: f64, of: f64| (index * of).sin() * 43758.5453 % 1.0;
     let point = |index: usize| {
-        let own = index as f64 + 1.0;
-        let at = DVec3::new(part(own, 12.9898), part(own, 78.233), part(own, 39.425));
+        let value = index as f64 + 1.0;
+        let at = DVec3::new(part(value, 12.9898), part(value, 78.233), part(value, 39.425));
         (0.9 * at, (25 + index * 53 % 140) as u8)
     };
     (0..60).map(point).collect()
@@ -54,8 +54,8 @@ fn taken(index: usize, size: (u32, u32)) -> Image {
         let Some(at) = pixel(index, size, point) else { continue };
         for (x, y) in (0..49).map(|i| (at.x as u32 + i % 7 - 3, at.y as u32 + i / 7 - 3)) {
             for plane in 0..3 {
-                let place = (plane * size.1 + y) * size.0 + x;
-                image.data[place as usize] = f32::from(grey) / 255.0;
+                let offset = (plane * size.1 + y) * size.0 + x;
+                image.data[offset as usize] = f32::from(grey) / 255.0;
             }
         }
     }
@@ -108,7 +108,7 @@ fn turned(image: Image, orientation: u8) -> Image {
     let path = folder.join("a.jpg");
     write(&Image::filled(8, 8, [0.0; 3]), &path);
     orient(&path, orientation);
-    image.turned(Orientation::of(&path))
+    image.turned(Orientation::from_file(&path))
 }
 
 fn loaded(root: &Path, orientation: PixelOrientation) -> (Dataset, String) {
@@ -121,10 +121,10 @@ fn loaded(root: &Path, orientation: PixelOrientation) -> (Dataset, String) {
 /// Whether the photographs are what their cameras took, up to what JPEG makes of it.
 fn are_right(dataset: &Dataset, size: (u32, u32)) -> bool {
     (0..VIEWS).all(|index| {
-        let own = view(dataset, &name(index)).image.as_ref().unwrap();
+        let image = view(dataset, &name(index)).image.as_ref().unwrap();
         let expected = taken(index, size);
-        let off = own.data.iter().zip(&expected.data).map(|(a, b)| (a - b).abs());
-        off.sum::<f32>() / (own.data.len() as f32) < 0.02
+        let off = image.data.iter().zip(&expected.data).map(|(a, b)| (a - b).abs());
+        off.sum::<f32>() / (image.data.len() as f32) < 0.02
     })
 }
 
@@ -139,8 +139,8 @@ fn points_that_photographs_share_tell_which_pixels_their_cameras_are_of() {
             let (dataset, message) = loaded(root, PixelOrientation::Auto);
             assert!(are_right(&dataset, size), "{size:?} {turn:?} {of_exif}");
             assert_eq!(message, "", "{size:?} {turn:?} {of_exif}");
-            let own = Orientation::of(&root.join("images/v00.jpg"));
-            let left = if of_exif { Orientation::UPRIGHT } else { own };
+            let orientation = Orientation::from_file(&root.join("images/v00.jpg"));
+            let left = if of_exif { Orientation::UPRIGHT } else { orientation };
             assert_eq!(view(&dataset, "v00").orientation, left);
         }
     }

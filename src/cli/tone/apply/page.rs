@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::photographs::Listed;
+use super::photographs::InputPhotograph;
 use super::{ApplyArgs, CurveOnSet, Mapped, Measures, ToneOutput, without};
 use crate::Result;
 use crate::base::output::write_whole;
@@ -11,14 +11,14 @@ use crate::photographs::image::Image;
 use crate::photographs::metrics::Scores;
 use crate::results::eval;
 use crate::results::report::{
-    Best, Column, Comparison, Distribution, Picture, Report, Table, distributions,
+    Best, Column, Comparison, Distribution, NumberTable, Picture, Report, distributions,
 };
 
 /// Maximum width of an image, pixels.
 const PICTURE_WIDTH: u32 = 480;
 
 /// The contents of the page, gathered while photographs are mapped.
-pub(super) struct Page {
+pub(super) struct TonePage {
     curve: String,
     /// Only photographs with a reference are drawn, if there are any, so that the histograms compare.
     only_referenced: bool,
@@ -29,8 +29,12 @@ pub(super) struct Page {
     comparison: Option<Comparison>,
 }
 
-impl Page {
-    pub(super) fn new(gpu: &Gpu, args: &ApplyArgs, photographs: &[Listed]) -> Result<Self> {
+impl TonePage {
+    pub(super) fn new(
+        gpu: &Gpu,
+        args: &ApplyArgs,
+        photographs: &[InputPhotograph],
+    ) -> Result<Self> {
         let compared = args.compare.iter().map(|curve| {
             let config = args.config(Some(curve))?;
             let masks = (args.input.as_path(), config.invert_masks);
@@ -52,7 +56,7 @@ impl Page {
     /// Adds a photograph and its result; the images of the first are shown.
     pub(super) fn add(
         &mut self,
-        listed: &Listed,
+        listed: &InputPhotograph,
         mapped: &Mapped,
         scores: Option<Scores>,
     ) -> Result<()> {
@@ -67,7 +71,7 @@ impl Page {
         for (set, distribution) in &mut self.compared {
             let (_, image, _) = set.result(photograph, gaps)?;
             distribution.add(&without(&image, gaps));
-            let scores = reference.as_ref().map(|reference| Scores::of(&image, reference));
+            let scores = reference.as_ref().map(|reference| Scores::measure(&image, reference));
             pictures.push(picture(&distribution.name, scores.transpose()?, &image));
         }
         if let Some(reference) = reference {
@@ -109,7 +113,7 @@ fn picture(caption: &str, scores: Option<Scores>, image: &Image) -> Picture {
     Picture::shrunk(caption, scores.unwrap_or_default(), image, PICTURE_WIDTH)
 }
 
-fn table(output: &ToneOutput) -> Table {
+fn table(output: &ToneOutput) -> NumberTable {
     let column =
         |name: &str, digits| Column { name: name.to_owned(), digits, best: Best::Unmarked };
     let measured = |Measures { mean_luminance, clipped_fraction, skewness, .. }: Measures| {
@@ -128,7 +132,7 @@ fn table(output: &ToneOutput) -> Table {
         ]);
         (name, values)
     });
-    Table {
+    NumberTable {
         title: "Per photograph, and means of the scene".to_owned(),
         label: "photograph".to_owned(),
         columns: vec![

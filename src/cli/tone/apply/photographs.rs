@@ -7,7 +7,7 @@ use std::sync::Arc;
 use super::ApplyArgs;
 use crate::base::output::is_same_file;
 use crate::base::tree;
-use crate::cli::ImageFormat;
+use crate::cli::OutputFormat;
 use crate::photographs::dataset::{Borders, Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
 use crate::photographs::image::{ColourCounts, Image, Mask, MaskFile, Orientation, PictureFile};
@@ -15,7 +15,7 @@ use crate::photographs::white_balance::{WhiteBalance, WhiteBalanceGains};
 use crate::{Error, Result};
 
 /// A photograph to map.
-pub(super) struct Listed {
+pub(super) struct InputPhotograph {
     /// The file name without extension.
     pub(super) name: String,
     pub(super) input: PathBuf,
@@ -31,7 +31,7 @@ pub(super) struct Listed {
     pub(super) borders: Arc<Borders>,
 }
 
-impl Listed {
+impl InputPhotograph {
     /// The photograph as stored, with the indices of pixels that are not finite or hidden by alpha or mask.
     pub(super) fn load(
         &self,
@@ -44,7 +44,7 @@ impl Listed {
         }
         let decoded = (&image, alpha.as_ref());
         let mask = Mask::over(&self.input, decoded, self.mask.as_ref(), inverted)?;
-        let mask = self.borders.hidden_too(mask, (image.width, image.height));
+        let mask = self.borders.hide_borders(mask, (image.width, image.height));
         let hidden = mask.as_ref().map(Mask::hidden).unwrap_or_default();
         Ok((image, hidden))
     }
@@ -52,7 +52,7 @@ impl Listed {
     /// Image and indices turned upright by Exif; photographs of a dataset stay as stored, as their cameras assume.
     pub(super) fn turned(&self, image: Image, gaps: Vec<usize>) -> (Image, Vec<usize>) {
         let orientation = match self.split {
-            None => Orientation::of(&self.input),
+            None => Orientation::from_file(&self.input),
             Some(_) => Orientation::UPRIGHT,
         };
         let is_gap = |value: &f32| *value > 0.0;
@@ -69,7 +69,10 @@ impl Listed {
 }
 
 /// The photographs of the input: a file, those of a folder by name, or those of a dataset.
-pub(super) fn listed(args: &ApplyArgs, balance: Option<&WhiteBalance>) -> Result<Vec<Listed>> {
+pub(super) fn listed(
+    args: &ApplyArgs,
+    balance: Option<&WhiteBalance>,
+) -> Result<Vec<InputPhotograph>> {
     let input = &args.input;
     let unreadable =
         |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));
@@ -80,7 +83,7 @@ pub(super) fn listed(args: &ApplyArgs, balance: Option<&WhiteBalance>) -> Result
         let options = LoadOptions { reference: args.reference.clone(), ..LoadOptions::default() };
         let of_dataset = Dataset::photographs(input, &options)?;
         let borders = Arc::new(Borders::of_photographs(&of_dataset));
-        let of_view = |Photograph { name, split, input, reference, mask }| Listed {
+        let of_view = |Photograph { name, split, input, reference, mask }| InputPhotograph {
             name,
             input,
             reference,
@@ -111,7 +114,7 @@ pub(super) fn listed(args: &ApplyArgs, balance: Option<&WhiteBalance>) -> Result
 }
 
 /// A photograph outside of a dataset.
-fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
+fn plain(input: &Path, reference: Option<&Path>) -> Result<InputPhotograph> {
     let stem = input.file_stem().unwrap_or_default();
     let reference = match reference {
         Some(folder) if folder.is_dir() => {
@@ -128,11 +131,24 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
     let mask = candidates.into_iter().find(|mask| mask.is_file()).map(MaskFile::shown);
     let input = input.to_owned();
     let borders = Arc::default();
-    Ok(Listed { name, input, reference, split: None, mask, target: None, gains: None, borders })
+    Ok(InputPhotograph {
+        name,
+        input,
+        reference,
+        split: None,
+        mask,
+        target: None,
+        gains: None,
+        borders,
+    })
 }
 
 /// Sets the file that each is written to, refusing duplicates and photographs.
-fn set_targets(photographs: &mut [Listed], out: &Path, format: ImageFormat) -> Result<()> {
+fn set_targets(
+    photographs: &mut [InputPhotograph],
+    out: &Path,
+    format: OutputFormat,
+) -> Result<()> {
     let extension = format.extension();
     let mut sources: Vec<PathBuf> = vec![];
     for listed in &*photographs {

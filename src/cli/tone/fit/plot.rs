@@ -35,7 +35,7 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
     let line = |name: &str, deviations: f64| {
         let columns = pooled.columns.iter();
         let columns = columns.filter(|column| column.count > MIN_COLUMN * count && column.x <= end);
-        let point = |column: &crate::photographs::fit::Column| {
+        let point = |column: &crate::photographs::fit::HistogramColumn| {
             let mean = column.sum_y / column.count;
             let deviation = (column.sum_y2 / column.count - mean * mean).max(0.0).sqrt();
             (column.x, mean + deviations * deviation)

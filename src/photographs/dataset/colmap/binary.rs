@@ -16,8 +16,8 @@ pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, Lens>> {
     reader.records(|reader| {
         let (id, model) = (reader.u32()?, reader.u32()?);
         let (width, height) = (reader.u64()?, reader.u64()?);
-        let known = MODELS.get(model as usize);
-        let (name, parameters) = known.ok_or_else(|| {
+        let row = MODELS.get(model as usize);
+        let (name, parameters) = row.ok_or_else(|| {
             let problem = format!("camera {id} has the unknown model {model}; {}", remedy(""));
             Error::input(path, problem)
         })?;

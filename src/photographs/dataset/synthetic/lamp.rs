@@ -46,7 +46,7 @@ pub(super) struct LampLight {
 
 impl CameraLamp {
     /// The lamp of a camera, of half its strength this many degrees off its axis.
-    pub(super) fn of(camera: &Camera, degrees: f64) -> Self {
+    pub(super) fn new(camera: &Camera, degrees: f64) -> Self {
         let world_from_view = camera.view_from_world.inverse();
         Self {
             position: world_from_view.transform_point3(OFFSET),

@@ -8,11 +8,11 @@ use glam::{DMat3, DVec2, DVec3};
 
 use super::Scene;
 use super::lamp::{self, CameraLamp};
-use super::shapes::{Noise, Shape, Surface, nearest, open_beside, smoothstep};
+use super::shapes::{SceneSurface, SurfaceShape, TextureNoise, nearest, open_beside, smoothstep};
 use crate::base::random::Stream;
 
 /// The look of a surface.
-struct Look {
+struct RoomMaterial {
     /// Linear reflectance at a position: in the world for planes, in the shape's own axes otherwise.
     albedo: fn(&Room, DVec3) -> DVec3,
     /// Strength of the highlight.
@@ -21,10 +21,10 @@ struct Look {
 
 /// The scene.
 pub(super) struct Room {
-    surfaces: Vec<Surface<Look>>,
+    surfaces: Vec<SceneSurface<RoomMaterial>>,
     /// Positions on the lamp, the same for every position that it lights, so that all views agree on the shadows.
     lamp: Vec<DVec3>,
-    noise: Noise,
+    noise: TextureNoise,
     /// Whether the cameras come close and turn, as those of who carries a lamp.
     is_walked: bool,
 }
@@ -43,17 +43,17 @@ const GROUND_RADIANCE: DVec3 = DVec3::new(0.07, 0.055, 0.04);
 impl Room {
     /// The room whose textures are drawn from `seed`; its cameras are at about one distance, or walk through it.
     pub(super) fn new(seed: u64, is_walked: bool) -> Self {
-        let plane = |normal, offset, albedo| Surface {
-            shape: Shape::Plane { normal, offset },
-            look: Look { albedo, gloss: 0.0 },
+        let plane = |normal, offset, albedo| SceneSurface {
+            shape: SurfaceShape::Plane { normal, offset },
+            material: RoomMaterial { albedo, gloss: 0.0 },
         };
-        let sphere = |center, radius, albedo| Surface {
-            shape: Shape::Sphere { center, radius },
-            look: Look { albedo, gloss: 0.25 },
+        let sphere = |center, radius, albedo| SceneSurface {
+            shape: SurfaceShape::Sphere { center, radius },
+            material: RoomMaterial { albedo, gloss: 0.25 },
         };
         let block = |center, half, yaw: f64, albedo| {
-            let shape = Shape::Block { center, half, turn: DMat3::from_rotation_z(-yaw) };
-            Surface { shape, look: Look { albedo, gloss: 0.0 } }
+            let shape = SurfaceShape::Block { center, half, turn: DMat3::from_rotation_z(-yaw) };
+            SceneSurface { shape, material: RoomMaterial { albedo, gloss: 0.0 } }
         };
         let surfaces = vec![
             plane(DVec3::Z, 0.0, Self::planks),
@@ -66,16 +66,16 @@ impl Room {
             block(DVec3::new(0.95, 0.45, 0.42), DVec3::new(0.5, 0.4, 0.42), 0.45, Self::checker),
             block(DVec3::new(0.12, 1.1, 0.62), DVec3::new(0.32, 0.2, 0.62), -0.3, Self::bands),
         ];
-        Self { surfaces, lamp: lamp_places(), noise: Noise(Stream::new(seed, 0)), is_walked }
+        Self { surfaces, lamp: lamp_places(), noise: TextureNoise(Stream::new(seed, 0)), is_walked }
     }
 
     /// The lamp's diffuse light (1 if perpendicular and unoccluded) and its highlight at a position.
     fn lamp(&self, position: DVec3, normal: DVec3, direction: DVec3, gloss: f64) -> (f64, f64) {
         let start = position + 1e-6 * normal;
         let (mut lit, mut highlight) = (0.0, 0.0);
-        for place in &self.lamp {
-            let distance = place.distance(start);
-            let to_lamp = (place - start) / distance;
+        for sample in &self.lamp {
+            let distance = sample.distance(start);
+            let to_lamp = (sample - start) / distance;
             let cosine = normal.dot(to_lamp);
             if cosine > 0.0 && self.is_clear(start, to_lamp, distance) {
                 lit += cosine;
@@ -88,8 +88,10 @@ impl Room {
     }
 
     fn is_clear(&self, origin: DVec3, direction: DVec3, distance: f64) -> bool {
-        let solids =
-            self.surfaces.iter().filter(|surface| !matches!(surface.shape, Shape::Plane { .. }));
+        let solids = self
+            .surfaces
+            .iter()
+            .filter(|surface| !matches!(surface.shape, SurfaceShape::Plane { .. }));
         solids
             .filter_map(|surface| surface.shape.hit(origin, direction))
             .all(|hit| hit.distance > distance)
@@ -100,8 +102,8 @@ impl Room {
     /// Each plane darkens nearby positions.
     fn openness(&self, position: DVec3, normal: DVec3) -> f64 {
         const REACH: f64 = 0.4;
-        let open = |surface: &Surface<Look>| match surface.shape {
-            Shape::Plane { normal: facing, offset } => {
+        let open = |surface: &SceneSurface<RoomMaterial>| match surface.shape {
+            SurfaceShape::Plane { normal: facing, offset } => {
                 let distance = position.dot(facing) - offset;
                 let away = 0.5 - 0.5 * normal.dot(facing);
                 1.0 - away * (-distance / REACH).exp() * 0.6
@@ -111,24 +113,24 @@ impl Room {
         self.surfaces.iter().map(open).product()
     }
 
-    fn planks(&self, place: DVec3) -> DVec3 {
+    fn planks(&self, position: DVec3) -> DVec3 {
         const WIDTH: f64 = 0.42;
-        let plank = (place.x / WIDTH).floor();
+        let plank = (position.x / WIDTH).floor();
         let shade = self.noise.value(DVec3::new(plank * 7.3, 0.5, 0.5));
         let grain =
-            self.noise.fractal(DVec3::new(place.x * 16.0, place.y * 1.8 + plank * 5.0, 3.0));
-        let across = (place.x / WIDTH - plank - 0.5).abs();
+            self.noise.fractal(DVec3::new(position.x * 16.0, position.y * 1.8 + plank * 5.0, 3.0));
+        let across = (position.x / WIDTH - plank - 0.5).abs();
         let gap = 1.0 - 0.55 * smoothstep(0.46, 0.49, across);
         let light = DVec3::new(0.66, 0.44, 0.26);
         let dark = DVec3::new(0.34, 0.19, 0.10);
         dark.lerp(light, 0.25 + 0.35 * shade + 0.6 * (grain - 0.35)) * gap
     }
 
-    fn back_wall(&self, place: DVec3) -> DVec3 {
+    fn back_wall(&self, position: DVec3) -> DVec3 {
         const PICTURE_CENTER: DVec2 = DVec2::new(-0.55, 1.56);
         const PICTURE_HALF: DVec2 = DVec2::new(0.62, 0.42);
         const FRAME: f64 = 0.07;
-        let in_picture = DVec2::new(place.x, place.z) - PICTURE_CENTER;
+        let in_picture = DVec2::new(position.x, position.z) - PICTURE_CENTER;
         let outside = in_picture.abs() - PICTURE_HALF;
         if outside.max_element() < 0.0 {
             return self.sunset(in_picture / PICTURE_HALF);
@@ -137,79 +139,80 @@ impl Room {
             return DVec3::new(0.16, 0.09, 0.05);
         }
         // Wallpaper: diamonds in two tones.
-        let (u, v) = (place.x / 0.36, place.z / 0.5);
+        let (u, v) = (position.x / 0.36, position.z / 0.5);
         let diamond = ((u + v).rem_euclid(1.0) - 0.5).abs() + ((u - v).rem_euclid(1.0) - 0.5).abs();
         let tone = smoothstep(0.42, 0.58, diamond);
         let paper = DVec3::new(0.50, 0.60, 0.55).lerp(DVec3::new(0.76, 0.74, 0.62), tone);
-        paper * (0.86 + 0.28 * self.noise.fractal(place * 5.0))
+        paper * (0.86 + 0.28 * self.noise.fractal(position * 5.0))
     }
 
     /// The image on the wall, at coordinates in [-1, 1], y up.
-    fn sunset(&self, place: DVec2) -> DVec3 {
+    fn sunset(&self, position: DVec2) -> DVec3 {
         let ridge =
-            -0.25 + 0.7 * (self.noise.fractal(DVec3::new(place.x * 2.2 + 9.0, 0.0, 7.0)) - 0.5);
-        if place.y < ridge {
+            -0.25 + 0.7 * (self.noise.fractal(DVec3::new(position.x * 2.2 + 9.0, 0.0, 7.0)) - 0.5);
+        if position.y < ridge {
             return DVec3::new(0.06, 0.10, 0.16)
-                .lerp(DVec3::new(0.16, 0.24, 0.22), (ridge - place.y).min(1.0));
+                .lerp(DVec3::new(0.16, 0.24, 0.22), (ridge - position.y).min(1.0));
         }
-        if (place - DVec2::new(0.3, 0.22)).length() < 0.26 {
+        if (position - DVec2::new(0.3, 0.22)).length() < 0.26 {
             return DVec3::new(0.95, 0.80, 0.45);
         }
         DVec3::new(0.90, 0.42, 0.20)
-            .lerp(DVec3::new(0.22, 0.26, 0.50), smoothstep(-0.4, 1.0, place.y))
+            .lerp(DVec3::new(0.22, 0.26, 0.50), smoothstep(-0.4, 1.0, position.y))
     }
 
-    fn plaster(&self, place: DVec3) -> DVec3 {
-        DVec3::new(0.62, 0.50, 0.40) * (0.7 + 0.5 * self.noise.fractal(place * 2.5))
+    fn plaster(&self, position: DVec3) -> DVec3 {
+        DVec3::new(0.62, 0.50, 0.40) * (0.7 + 0.5 * self.noise.fractal(position * 2.5))
     }
 
-    fn beach_ball(&self, place: DVec3) -> DVec3 {
+    fn beach_ball(&self, position: DVec3) -> DVec3 {
         const WEDGES: [DVec3; 3] = [
             DVec3::new(0.05, 0.36, 0.42),
             DVec3::new(0.82, 0.78, 0.66),
             DVec3::new(0.78, 0.30, 0.10),
         ];
-        let place = DMat3::from_rotation_x(0.6) * place;
-        if place.z > 0.93 {
+        let position = DMat3::from_rotation_x(0.6) * position;
+        if position.z > 0.93 {
             return WEDGES[1];
         }
-        let wedge = ((place.y.atan2(place.x) / TAU).rem_euclid(1.0) * 9.0) as usize % WEDGES.len();
-        WEDGES[wedge] * (0.88 + 0.24 * self.noise.fractal(place * 6.0))
+        let wedge =
+            ((position.y.atan2(position.x) / TAU).rem_euclid(1.0) * 9.0) as usize % WEDGES.len();
+        WEDGES[wedge] * (0.88 + 0.24 * self.noise.fractal(position * 6.0))
     }
 
-    fn marble(&self, place: DVec3) -> DVec3 {
-        let turbulence = self.noise.fractal(place * 2.6);
-        let vein = (PI * (1.6 * place.x + 2.0 * place.z + 3.2 * turbulence)).sin().abs();
+    fn marble(&self, position: DVec3) -> DVec3 {
+        let turbulence = self.noise.fractal(position * 2.6);
+        let vein = (PI * (1.6 * position.x + 2.0 * position.z + 3.2 * turbulence)).sin().abs();
         DVec3::new(0.80, 0.74, 0.70).lerp(DVec3::new(0.34, 0.05, 0.10), (1.0 - vein).powi(2))
     }
 
-    fn apple(&self, place: DVec3) -> DVec3 {
-        let blush = smoothstep(0.3, 0.75, self.noise.fractal(place * 2.0) + 0.2 * place.x);
+    fn apple(&self, position: DVec3) -> DVec3 {
+        let blush = smoothstep(0.3, 0.75, self.noise.fractal(position * 2.0) + 0.2 * position.x);
         DVec3::new(0.26, 0.46, 0.08).lerp(DVec3::new(0.70, 0.16, 0.06), blush)
     }
 
-    fn checker(&self, place: DVec3) -> DVec3 {
+    fn checker(&self, position: DVec3) -> DVec3 {
         const CELL: f64 = 0.21;
         // Slightly off the faces, so that rounding does not choose the cell.
-        let cells = ((place + 1e-4) / CELL).floor().element_sum() as i64;
+        let cells = ((position + 1e-4) / CELL).floor().element_sum() as i64;
         let tone = if cells & 1 == 0 {
             DVec3::new(0.78, 0.56, 0.14)
         } else {
             DVec3::new(0.10, 0.14, 0.30)
         };
-        tone * (0.85 + 0.3 * self.noise.fractal(place * 9.0))
+        tone * (0.85 + 0.3 * self.noise.fractal(position * 9.0))
     }
 
-    fn bands(&self, place: DVec3) -> DVec3 {
+    fn bands(&self, position: DVec3) -> DVec3 {
         const BANDS: [DVec3; 4] = [
             DVec3::new(0.62, 0.16, 0.14),
             DVec3::new(0.80, 0.76, 0.68),
             DVec3::new(0.16, 0.34, 0.20),
             DVec3::new(0.86, 0.62, 0.22),
         ];
-        let wave = 0.04 * (place.x * 14.0 + place.y * 9.0).sin();
-        let band = ((place.z + wave + 1.0) / 0.155).floor() as usize;
-        BANDS[band % BANDS.len()] * (0.9 + 0.2 * self.noise.fractal(place * 8.0))
+        let wave = 0.04 * (position.x * 14.0 + position.y * 9.0).sin();
+        let band = ((position.z + wave + 1.0) / 0.155).floor() as usize;
+        BANDS[band % BANDS.len()] * (0.9 + 0.2 * self.noise.fractal(position * 8.0))
     }
 }
 
@@ -224,15 +227,15 @@ impl Scene for Room {
             return [SKY_RADIANCE; 2];
         };
         let position = origin + hit.distance * direction;
-        let albedo = (surface.look.albedo)(self, hit.place);
+        let albedo = (surface.material.albedo)(self, hit.position);
         let up = 0.5 + 0.5 * hit.normal.z;
         let ambient = GROUND_RADIANCE.lerp(SKY_RADIANCE, up) * self.openness(position, hit.normal);
-        let (lit, highlight) = self.lamp(position, hit.normal, direction, surface.look.gloss);
+        let (lit, highlight) = self.lamp(position, hit.normal, direction, surface.material.gloss);
         let radiance = albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * highlight;
         let Some(carried) = carried else { return [radiance; 2] };
         let is_clear = |start, direction, distance| self.is_clear(start, direction, distance);
         let light = carried.light(position, hit.normal, is_clear).map(|light| {
-            let shine = surface.look.gloss * shine(light.to_lamp, hit.normal, direction);
+            let shine = surface.material.gloss * shine(light.to_lamp, hit.normal, direction);
             light.radiance * (albedo * light.cosine + shine)
         });
         [lamp::EVEN * albedo, lamp::AMBIENT * radiance + light.unwrap_or(DVec3::ZERO)]
@@ -245,7 +248,7 @@ impl Scene for Room {
 
     /// Cameras on a part of a sphere in front of the scene, spread evenly by a low-discrepancy sequence (Roberts' R2),
     /// so that every 8th is among the others. Those that walk come close, and look beside the focus.
-    fn place(&self, view: usize, _views: usize) -> [DVec3; 2] {
+    fn camera_position(&self, view: usize, _views: usize) -> [DVec3; 2] {
         const AZIMUTH: f64 = 0.75; // radians to either side
         const ELEVATION: (f64, f64) = (0.24, 0.62); // radians
         const BESIDE: DVec3 = DVec3::new(1.3, 0.0, 0.7);

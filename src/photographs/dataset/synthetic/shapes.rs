@@ -5,7 +5,7 @@ use glam::{DMat3, DVec3};
 use crate::base::random::Stream;
 
 /// The shape of a surface.
-pub(super) enum Shape {
+pub(super) enum SurfaceShape {
     /// The points whose dot product with the unit normal is the offset; visible from the side of the normal.
     Plane { normal: DVec3, offset: f64 },
     /// A sphere.
@@ -15,9 +15,9 @@ pub(super) enum Shape {
 }
 
 /// A shape with its look.
-pub(super) struct Surface<L> {
-    pub(super) shape: Shape,
-    pub(super) look: L,
+pub(super) struct SceneSurface<L> {
+    pub(super) shape: SurfaceShape,
+    pub(super) material: L,
 }
 
 /// The intersection of a ray and a surface.
@@ -25,29 +25,29 @@ pub(super) struct Hit {
     pub(super) distance: f64,
     pub(super) normal: DVec3,
     /// The position at which the albedo is evaluated.
-    pub(super) place: DVec3,
+    pub(super) position: DVec3,
 }
 
 /// The first surface along a ray.
 pub(super) fn nearest<'a, L>(
-    surfaces: impl Iterator<Item = &'a Surface<L>>,
+    surfaces: impl Iterator<Item = &'a SceneSurface<L>>,
     origin: DVec3,
     direction: DVec3,
-) -> Option<(&'a Surface<L>, Hit)> {
+) -> Option<(&'a SceneSurface<L>, Hit)> {
     let hits =
         surfaces.filter_map(|surface| Some((surface, surface.shape.hit(origin, direction)?)));
     hits.min_by(|(_, a), (_, b)| a.distance.total_cmp(&b.distance))
 }
 
-impl Shape {
+impl SurfaceShape {
     /// The first point of a ray on the shape's outside, if any.
     pub(super) fn hit(&self, origin: DVec3, direction: DVec3) -> Option<Hit> {
         match *self {
             Self::Plane { normal, offset } => {
                 let speed = direction.dot(normal);
                 let distance = (offset - origin.dot(normal)) / speed;
-                let place = origin + distance * direction;
-                (speed < 0.0 && distance > 0.0).then_some(Hit { distance, normal, place })
+                let position = origin + distance * direction;
+                (speed < 0.0 && distance > 0.0).then_some(Hit { distance, normal, position })
             }
             Self::Sphere { center, radius } => {
                 let from_center = origin - center;
@@ -56,7 +56,7 @@ impl Shape {
                 let distance = -half_b - root.sqrt();
                 let normal = (from_center + distance * direction) / radius;
                 // A negative root makes the distance NaN, which is not greater than zero either.
-                (distance > 0.0).then_some(Hit { distance, normal, place: normal })
+                (distance > 0.0).then_some(Hit { distance, normal, position: normal })
             }
             Self::Block { center, half, turn } => {
                 let (origin, direction) = (turn * (origin - center), turn * direction);
@@ -65,11 +65,11 @@ impl Shape {
                 let distance = enter.max_element();
                 let axis = [DVec3::X, DVec3::Y, DVec3::Z][enter.max_position()];
                 let normal = turn.transpose() * (-axis * direction.dot(axis).signum());
-                let place = origin + distance * direction;
+                let position = origin + distance * direction;
                 (distance > 0.0 && distance < exit.min_element()).then_some(Hit {
                     distance,
                     normal,
-                    place,
+                    position,
                 })
             }
         }
@@ -77,13 +77,13 @@ impl Shape {
 }
 
 /// The noise of textures.
-pub(super) struct Noise(pub(super) Stream);
+pub(super) struct TextureNoise(pub(super) Stream);
 
-impl Noise {
+impl TextureNoise {
     /// Value noise in [0, 1] with quintic interpolation, one feature per unit.
-    pub(super) fn value(&self, place: DVec3) -> f64 {
-        let cell = place.floor();
-        let t = place - cell;
+    pub(super) fn value(&self, position: DVec3) -> f64 {
+        let cell = position.floor();
+        let t = position - cell;
         let t = t * t * t * (t * (6.0 * t - 15.0) + 10.0);
         let [x, y, z] = cell.to_array().map(|coordinate| coordinate as i64);
         let corner = |dx: i64, dy: i64, dz: i64| {
@@ -96,9 +96,10 @@ impl Noise {
     }
 
     /// Three octaves of noise, in [0, 1].
-    pub(super) fn fractal(&self, place: DVec3) -> f64 {
-        let octave =
-            |k: i32| 0.5f64.powi(k) * self.value(place * f64::from(1 << k) + 17.0 * f64::from(k));
+    pub(super) fn fractal(&self, position: DVec3) -> f64 {
+        let octave = |k: i32| {
+            0.5f64.powi(k) * self.value(position * f64::from(1 << k) + 17.0 * f64::from(k))
+        };
         (octave(0) + octave(1) + octave(2)) / 1.75
     }
 }
@@ -111,12 +112,14 @@ fn hidden_by_sphere(position: DVec3, normal: DVec3, center: DVec3, radius: f64) 
 }
 
 /// The share of the sky above a position that a solid leaves visible: it hides what its bounding sphere hides.
-pub(super) fn open_beside<L>(solid: &Surface<L>, position: DVec3, normal: DVec3) -> f64 {
+pub(super) fn open_beside<L>(solid: &SceneSurface<L>, position: DVec3, normal: DVec3) -> f64 {
     let hidden = |center, radius| hidden_by_sphere(position, normal, center, radius);
     match solid.shape {
-        Shape::Plane { .. } => 1.0,
-        Shape::Sphere { center, radius } => 1.0 - hidden(center, radius),
-        Shape::Block { center, half, .. } => 1.0 - 0.8 * hidden(center, half.element_sum() / 3.0),
+        SurfaceShape::Plane { .. } => 1.0,
+        SurfaceShape::Sphere { center, radius } => 1.0 - hidden(center, radius),
+        SurfaceShape::Block { center, half, .. } => {
+            1.0 - 0.8 * hidden(center, half.element_sum() / 3.0)
+        }
     }
 }
 

@@ -11,13 +11,13 @@ pub(super) type Rows = Vec<Vec<Option<f64>>>;
 pub(super) fn rows<'de, D: Deserializer<'de>>(matrix: D) -> Result<Rows, D::Error> {
     #[derive(Deserialize)]
     #[serde(untagged)]
-    enum Listed {
+    enum MatrixValues {
         Rows(Rows),
         Flat(Vec<Option<f64>>),
     }
-    Ok(match Listed::deserialize(matrix)? {
-        Listed::Rows(rows) => rows,
-        Listed::Flat(numbers) => numbers.chunks(4).map(<[_]>::to_vec).collect(),
+    Ok(match MatrixValues::deserialize(matrix)? {
+        MatrixValues::Rows(rows) => rows,
+        MatrixValues::Flat(numbers) => numbers.chunks(4).map(<[_]>::to_vec).collect(),
     })
 }
 

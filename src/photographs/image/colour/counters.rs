@@ -15,7 +15,7 @@ pub(crate) struct ColourCounts {
 
 impl Default for ColourCounts {
     fn default() -> Self {
-        Self::of("photograph")
+        Self::new("photograph")
     }
 }
 
@@ -32,7 +32,7 @@ const SMALL: f64 = 0.01;
 
 impl ColourCounts {
     /// For items of this name.
-    pub(crate) fn of(what: &'static str) -> Self {
+    pub(crate) fn new(what: &'static str) -> Self {
         Self { what, counts: Mutex::default() }
     }
 
@@ -50,7 +50,7 @@ impl ColourCounts {
     }
 
     /// Logs the counts.
-    pub(crate) fn say(&self) {
+    pub(crate) fn log(&self) {
         self.lines().iter().for_each(|line| tracing::warn!("{line}"));
     }
 

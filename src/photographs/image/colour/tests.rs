@@ -50,7 +50,7 @@ fn holds_the_colours(bytes: &[u8], name: &str, tolerance: f64) {
     assert_eq!(conversion.unknown, None);
     for (x, linear) in COLOURS.into_iter().enumerate() {
         for (value, linear) in image.pixel(x as u32, 0).into_iter().zip(linear) {
-            let expected = Encoding::Srgb.encode(linear);
+            let expected = TransferFunction::Srgb.encode(linear);
             assert!(
                 (f64::from(value) - expected).abs() < tolerance,
                 "{name} {x}: {value} for {expected}"
@@ -60,18 +60,18 @@ fn holds_the_colours(bytes: &[u8], name: &str, tolerance: f64) {
     }
 }
 
-fn in_space(space: [[f64; 2]; 4], curve: Encoding) -> Vec<[f64; 3]> {
+fn in_space(space: [[f64; 2]; 4], curve: TransferFunction) -> Vec<[f64; 3]> {
     COLOURS.map(|linear| encoded(linear, space, curve)).to_vec()
 }
 
 /// Every space that cameras and raw converters write, with its encoding and name.
-fn spaces() -> [([[f64; 2]; 4], Encoding, &'static str); 5] {
+fn spaces() -> [([[f64; 2]; 4], TransferFunction, &'static str); 5] {
     [
-        (P3, Encoding::Srgb, "Display P3"),
-        (ADOBE, Encoding::Power(2.199_218_75), "Adobe RGB"),
-        (PROPHOTO, Encoding::Power(1.8), "ProPhoto RGB"),
-        (SRGB, Encoding::Power(1.0), "\"of a test\""),
-        (SRGB, Encoding::Power(2.2), "\"of a test\""),
+        (P3, TransferFunction::Srgb, "Display P3"),
+        (ADOBE, TransferFunction::Power(2.199_218_75), "Adobe RGB"),
+        (PROPHOTO, TransferFunction::Power(1.8), "ProPhoto RGB"),
+        (SRGB, TransferFunction::Power(1.0), "\"of a test\""),
+        (SRGB, TransferFunction::Power(2.2), "\"of a test\""),
     ]
 }
 
@@ -87,16 +87,16 @@ fn a_matrix_profile_restores_the_colours_of_png_and_tiff() {
 
 #[test]
 fn the_profile_of_a_webp_is_used() {
-    let colours = in_space(ADOBE, Encoding::Power(2.199_218_75));
+    let colours = in_space(ADOBE, TransferFunction::Power(2.199_218_75));
     let bytes: Vec<u8> =
         colours.concat().iter().map(|value| (value * 255.0).round() as u8).collect();
     let mut file = vec![];
     let mut encoder = ::image::codecs::webp::WebPEncoder::new_lossless(&mut file);
-    encoder.set_icc_profile(matrix_profile(ADOBE, Encoding::Power(2.199_218_75))).unwrap();
+    encoder.set_icc_profile(matrix_profile(ADOBE, TransferFunction::Power(2.199_218_75))).unwrap();
     encoder.write_image(&bytes, colours.len() as u32, 1, ExtendedColorType::Rgb8).unwrap();
     let (image, conversion) = read(&file);
     assert_eq!(conversion.from.unwrap().0, "Adobe RGB");
-    let expected = Encoding::Srgb.encode(COLOURS[4][0]);
+    let expected = TransferFunction::Srgb.encode(COLOURS[4][0]);
     assert!((f64::from(image.pixel(4, 0)[0]) - expected).abs() < 6e-3);
 }
 
@@ -110,12 +110,12 @@ fn jpeg(code: u8) -> Vec<u8> {
 
 #[test]
 fn the_parts_of_a_profile_are_assembled_in_their_order() {
-    let profile = matrix_profile(ADOBE, Encoding::Power(2.199_218_75));
+    let profile = matrix_profile(ADOBE, TransferFunction::Power(2.199_218_75));
     let mut segments = profile_segments(&profile, 100);
     segments.reverse();
     let (image, conversion) = read(&with_segments(&jpeg(10), &segments));
     assert_eq!(conversion.from.unwrap().0, "Adobe RGB");
-    let expected = Encoding::Srgb.encode((10.0_f64 / 255.0).powf(2.2));
+    let expected = TransferFunction::Srgb.encode((10.0_f64 / 255.0).powf(2.2));
     assert!((f64::from(image.data[0]) - expected).abs() < 3e-4, "{}", image.data[0]);
     segments.pop();
     let (image, conversion) = read(&with_segments(&jpeg(10), &segments));
@@ -144,7 +144,7 @@ fn exif_without_a_profile_can_mean_adobe_rgb() {
 
 #[test]
 fn a_profile_overrides_exif() {
-    let srgb = profile_segments(&matrix_profile(SRGB, Encoding::Srgb), 60_000);
+    let srgb = profile_segments(&matrix_profile(SRGB, TransferFunction::Srgb), 60_000);
     let segments = [srgb, vec![exif(Some(65535), Some(b"R03\0"))]].concat();
     let (image, conversion) = read(&with_segments(&jpeg(10), &segments));
     assert_eq!((image.data[0], conversion), (10.0 / 255.0, Conversion::default()));
@@ -157,7 +157,7 @@ fn srgb_values_keep_every_bit() {
     let chunks: [Vec<(&[u8; 4], Vec<u8>)>; 9] = [
         vec![],
         vec![(b"sRGB", vec![0])],
-        vec![(b"iCCP", iccp(&matrix_profile(SRGB, Encoding::Srgb)))],
+        vec![(b"iCCP", iccp(&matrix_profile(SRGB, TransferFunction::Srgb)))],
         vec![(b"cICP", vec![1, 13, 0, 1])],
         // Frames of clips, from newer and older ffmpeg.
         vec![(b"cICP", vec![1, 1, 0, 1]), (b"gAMA", hundred_thousandths(&[0.50994]))],
@@ -177,12 +177,12 @@ fn srgb_values_keep_every_bit() {
 
 #[test]
 fn the_chunks_of_a_png_have_the_precedence_of_its_specification() {
-    let colours = in_space(P3, Encoding::Srgb);
-    let p3 = || (b"iCCP", iccp(&matrix_profile(P3, Encoding::Srgb)));
+    let colours = in_space(P3, TransferFunction::Srgb);
+    let p3 = || (b"iCCP", iccp(&matrix_profile(P3, TransferFunction::Srgb)));
     let linear = || (b"gAMA", hundred_thousandths(&[1.0]));
     holds_the_colours(&png(&colours, &[linear(), (b"sRGB", vec![0]), p3()]), "Display P3", 3e-4);
     let cicp = (b"cICP", vec![12, 13, 0, 1]);
-    let adobe = (b"iCCP", iccp(&matrix_profile(ADOBE, Encoding::Power(2.2))));
+    let adobe = (b"iCCP", iccp(&matrix_profile(ADOBE, TransferFunction::Power(2.2))));
     holds_the_colours(&png(&colours, &[adobe, cicp]), "Display P3", 3e-4);
     // After a statement that cannot be used, the next applies.
     let file = png(&colours, &[(b"cICP", vec![9, 16, 0, 1]), p3()]);
@@ -196,30 +196,32 @@ fn gamma_and_chromaticities_convert_without_a_profile() {
     let gamma = |value: f64| (b"gAMA", hundred_thousandths(&[value]));
     let primaries = |space: [[f64; 2]; 4]| (b"cHRM", hundred_thousandths(&space.concat()));
     let file = |space, curve, chunks: &[_]| png(&in_space(space, curve), chunks);
-    let linear = file(SRGB, Encoding::Power(1.0), &[gamma(1.0)]);
+    let linear = file(SRGB, TransferFunction::Power(1.0), &[gamma(1.0)]);
     holds_the_colours(&linear, "sRGB at gamma 1.00", 3e-4);
-    let adobe = file(ADOBE, Encoding::Power(2.2), &[gamma(0.45455), primaries(ADOBE)]);
+    let adobe = file(ADOBE, TransferFunction::Power(2.2), &[gamma(0.45455), primaries(ADOBE)]);
     holds_the_colours(&adobe, "Adobe RGB", 3e-4);
-    let wide = file(P3, Encoding::Srgb, &[primaries(P3)]);
+    let wide = file(P3, TransferFunction::Srgb, &[primaries(P3)]);
     holds_the_colours(&wide, "Display P3", 3e-4);
     // A frame of a wide-gamut clip.
-    let frame = file(P3, Encoding::Srgb, &[gamma(0.50994), primaries(P3)]);
+    let frame = file(P3, TransferFunction::Srgb, &[gamma(0.50994), primaries(P3)]);
     holds_the_colours(&frame, "Display P3", 3e-4);
 }
 
 #[test]
 fn grey_is_converted_by_its_curve() {
-    let file =
-        with_segments(&jpeg(10), &profile_segments(&grey_profile(Encoding::Power(1.8)), 60_000));
+    let file = with_segments(
+        &jpeg(10),
+        &profile_segments(&grey_profile(TransferFunction::Power(1.8)), 60_000),
+    );
     let (image, conversion) = read(&file);
     assert_eq!(conversion.from.unwrap().0, "\"grey\"");
-    let expected = Encoding::Srgb.encode((10.0_f64 / 255.0).powf(1.8));
+    let expected = TransferFunction::Srgb.encode((10.0_f64 / 255.0).powf(1.8));
     assert!((f64::from(image.data[0]) - expected).abs() < 1e-4);
 }
 
 #[test]
 fn metadata_that_cannot_be_used_is_named_and_the_values_stay() {
-    let whole = matrix_profile(ADOBE, Encoding::Power(2.2));
+    let whole = matrix_profile(ADOBE, TransferFunction::Power(2.2));
     let cut = &whole[..whole.len() / 2];
     let gamma = hundred_thousandths(&[0.0]);
     let cases: [(&[u8; 4], Vec<u8>, &str); 8] = [
@@ -242,7 +244,8 @@ fn metadata_that_cannot_be_used_is_named_and_the_values_stay() {
 
 #[test]
 fn a_damaged_profile_is_only_ignored() {
-    for whole in [matrix_profile(ADOBE, Encoding::Power(2.2)), table_profile(PROPHOTO, 1.8)] {
+    for whole in [matrix_profile(ADOBE, TransferFunction::Power(2.2)), table_profile(PROPHOTO, 1.8)]
+    {
         for at in 0..whole.len() {
             let mut damaged = whole.clone();
             damaged[at] ^= 0x5A;
@@ -260,7 +263,8 @@ fn a_damaged_profile_is_only_ignored() {
 fn colours_outside_srgb_are_clipped_and_counted() {
     // The green of Adobe RGB, its white, and a grey.
     let colours = [[0.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.2, 0.2, 0.2], [0.1, 0.1, 0.1]];
-    let file = png(&colours, &[(b"iCCP", iccp(&matrix_profile(ADOBE, Encoding::Power(2.2))))]);
+    let file =
+        png(&colours, &[(b"iCCP", iccp(&matrix_profile(ADOBE, TransferFunction::Power(2.2))))]);
     let (image, conversion) = read(&file);
     assert_eq!(conversion.from.unwrap().1, 0.25);
     assert_eq!(image.pixel(0, 0)[0], 0.0);
@@ -272,8 +276,8 @@ fn an_exr_of_other_primaries_is_converted_unless_it_contains_numbers() {
     use exr::prelude::{SpecificChannels, Vec2, WritableImage};
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.exr");
-    let stored =
-        COLOURS.map(|linear| encoded(linear, P3, Encoding::Power(1.0)).map(|value| value as f32));
+    let stored = COLOURS
+        .map(|linear| encoded(linear, P3, TransferFunction::Power(1.0)).map(|value| value as f32));
     let channels = SpecificChannels::rgb(|Vec2(x, _): Vec2<usize>| {
         let [red, green, blue] = stored[x];
         (red, green, blue)
@@ -288,7 +292,7 @@ fn an_exr_of_other_primaries_is_converted_unless_it_contains_numbers() {
     for (x, linear) in COLOURS.into_iter().enumerate() {
         assert_eq!(numbers.pixel(x as u32, 0), stored[x]);
         for (value, linear) in loaded.pixel(x as u32, 0).into_iter().zip(linear) {
-            assert!((f64::from(value) - Encoding::Srgb.encode(linear)).abs() < 1e-4, "{x}");
+            assert!((f64::from(value) - TransferFunction::Srgb.encode(linear)).abs() < 1e-4, "{x}");
         }
     }
 }

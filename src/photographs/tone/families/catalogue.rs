@@ -124,7 +124,7 @@ families! {
             alpha: 0.12,
             gain_c: 1.0,
         },
-        |t| ((T::of(0.0720) * t - T::of(0.4376)) * t + T::of(0.9948)) * t;
+        |t| ((T::from_f64(0.0720) * t - T::from_f64(0.4376)) * t + T::from_f64(0.9948)) * t;
 
     FittedCubic = CURVE_FITTED_CUBIC: "fitted_cubic",
         "a t^3 + b t^2 + c t + d",
@@ -139,7 +139,7 @@ families! {
     ExpPlateau = CURVE_EXP_PLATEAU: "exp_plateau",
         "a (1 - exp(-b max(t, 1e-10)^c))",
         [a = 1.0799 in 0.1..5.0, b = 1.1150 in 0.01..10.0, c = 0.8076 in 0.1..3.0],
-        |t| a * (b * t.at_least(T::of(1e-10)).power(c)).one_minus_exp();
+        |t| a * (b * t.at_least(T::from_f64(1e-10)).power(c)).one_minus_exp();
 
     PowerSoftexp = CURVE_POWER_SOFTEXP: "power_softexp",
         "(1 - exp(-a t))^b",
@@ -168,7 +168,7 @@ families! {
     Reinhard = CURVE_REINHARD: "reinhard",
         "a t / (t + b + 1e-10)",
         [a = 1.2180 in 0.1..5.0, b = 0.6763 in 0.01..10.0],
-        |t| a * t / (t + b + T::of(1e-10));
+        |t| a * t / (t + b + T::from_f64(1e-10));
 
     SoftexpGamma = CURVE_SOFTEXP_GAMMA: "softexp_gamma",
         "a (1 - exp(-b t))^c",
@@ -183,7 +183,7 @@ families! {
             c = 34.8493 in 0.0..200.0,
             d = 37.8681 in 0.0..200.0,
         ],
-        |t| (a + b * t) * t / (T::of(1.0) + (c + d * t) * t + T::of(1e-10));
+        |t| (a + b * t) * t / (T::from_f64(1.0) + (c + d * t) * t + T::from_f64(1e-10));
 
     Poly5Origin = CURVE_POLY5_ORIGIN: "poly5_origin",
         "a t^5 + b t^4 + c t^3 + d t^2 + e t",
@@ -213,14 +213,14 @@ families! {
     Gamma = CURVE_GAMMA: "gamma",
         "a max(t, 1e-10)^b",
         [a = 0.7199 in 0.05..5.0, b = 0.5617 in 0.1..3.0],
-        |t| a * t.at_least(T::of(1e-10)).power(b);
+        |t| a * t.at_least(T::from_f64(1e-10)).power(b);
 
     SinhRatio = CURVE_SINH_RATIO: "sinh_ratio",
         "a sinh(b t) / (sinh(b t) + c)",
         [a = 1.0067 in 0.1..5.0, b = 1.3673 in 0.01..10.0, c = 0.7115 in 0.01..10.0],
         |t| {
-            let q = (T::of(2.0) * b * t).one_minus_exp();
-            a * q / (q + T::of(2.0) * c * (-b * t).exp())
+            let q = (T::from_f64(2.0) * b * t).one_minus_exp();
+            a * q / (q + T::from_f64(2.0) * c * (-b * t).exp())
         };
 
     Hybrid = CURVE_HYBRID: "hybrid",
@@ -233,7 +233,7 @@ families! {
             e = 0.4584 in 0.1..3.0,
         ],
         |t| {
-            let floor = t.at_least(T::of(1e-10));
+            let floor = t.at_least(T::from_f64(1e-10));
             a * (b * t).one_minus_exp().power(c) + d * floor.power(e)
         };
 
@@ -250,7 +250,7 @@ families! {
     SqrtBlend = CURVE_SQRT_BLEND: "sqrt_blend",
         "a sqrt(max(t, 1e-10)) + b t",
         [a = 0.6186 in 0.0..5.0, b = 0.0970 in 0.0..5.0],
-        |t| a * t.at_least(T::of(1e-10)).sqrt() + b * t;
+        |t| a * t.at_least(T::from_f64(1e-10)).sqrt() + b * t;
 
     Softexp = CURVE_SOFTEXP: "softexp",
         "1 - exp(-a t)",
@@ -272,14 +272,14 @@ families! {
             a = 0.6527 from 1.0 in 0.1..5.0,
             b = 2.1182 from 2.39 in 0.01..20.0,
         ] { aliases: &["arctan"], bounded: true },
-        |t| a * (b * t).atan() / T::of(FRAC_PI_2);
+        |t| a * (b * t).atan() / T::from_f64(FRAC_PI_2);
 
     Bezier3 = CURVE_BEZIER3: "bezier3",
         "s (3 (1 - s)^2 a s + 3 (1 - s) s^2 b + s^3), s = min(t, 1)",
         [a = 0.5561 in 0.0..3.0, b = 0.9430 in 0.0..3.0] { domain: [0.0, 1.0], bounded: true },
         |t| {
-            let s = t.at_most(T::of(1.0));
-            let (left, three) = (T::of(1.0) - s, T::of(3.0));
+            let s = t.at_most(T::from_f64(1.0));
+            let (left, three) = (T::from_f64(1.0) - s, T::from_f64(3.0));
             s * (three * left * left * a * s + three * left * s * s * b + s * s * s)
         };
 
@@ -293,7 +293,7 @@ families! {
             e = 0.8845 from 1.2 in 0.1..4.0,
         ],
         |t| {
-            let zero = T::of(0.0);
+            let zero = T::from_f64(0.0);
             let first = t.at_most(d);
             let second = (t - d).at_least(zero).at_most(e - d);
             a * first + b * second + c * (t - e).at_least(zero)
@@ -309,7 +309,7 @@ families! {
             e = 0.2189 from 1.0 in 0.0..10.0,
             f = 0.0001 from 0.1 in 1e-6..10.0,
         ] { monotone: false, identifiable: false },
-        |t| a * (b * t + c) * t / ((d * t + e) * t + f + T::of(1e-10));
+        |t| a * (b * t + c) * t / ((d * t + e) * t + f + T::from_f64(1e-10));
 
     Richards = CURVE_RICHARDS: "richards",
         "a (1 + b exp(-c t))^(-1 / d)",
@@ -319,7 +319,7 @@ families! {
             c = 1.9246 from 4.0 in 0.01..20.0,
             d = 0.4813 from 1.0 in 0.05..5.0,
         ],
-        |t| a * (T::of(1.0) + b * (-c * t).exp()).power(-T::of(1.0) / d);
+        |t| a * (T::from_f64(1.0) + b * (-c * t).exp()).power(-T::from_f64(1.0) / d);
 
     ArctanStandard = CURVE_ARCTAN_STANDARD: "arctan-standard",
         "(2 / pi) atan((pi / 2) a t)",
@@ -327,7 +327,7 @@ families! {
             source: "the arctangent sigmoid with slope a at 0 and limit 1; a fitted to power_softexp on [0, 3]",
             bounded: true,
         },
-        |t| (T::of(FRAC_PI_2) * a * t).atan() / T::of(FRAC_PI_2);
+        |t| (T::from_f64(FRAC_PI_2) * a * t).atan() / T::from_f64(FRAC_PI_2);
 
     Bezier3Standard = CURVE_BEZIER3_STANDARD: "bezier3-standard",
         "3 (1 - s)^2 s p1 + 3 (1 - s) s^2 p2 + s^3, s = min(t / end, 1)",
@@ -337,8 +337,8 @@ families! {
             bounded: true,
         },
         |t| {
-            let s = (t / end).at_most(T::of(1.0));
-            let (left, three) = (T::of(1.0) - s, T::of(3.0));
+            let s = (t / end).at_most(T::from_f64(1.0));
+            let (left, three) = (T::from_f64(1.0) - s, T::from_f64(3.0));
             three * left * left * s * p1 + three * left * s * s * p2 + s * s * s
         };
 
@@ -356,7 +356,7 @@ families! {
             bounded: true,
         },
         |t| {
-            let (zero, one) = (T::of(0.0), T::of(1.0));
+            let (zero, one) = (T::from_f64(0.0), T::from_f64(1.0));
             let first = (t / t1).at_most(one);
             let second = ((t - t1).at_least(zero) / (t2 - t1)).at_most(one);
             let third = ((t - t2).at_least(zero) / (t3 - t2)).at_most(one);
@@ -381,7 +381,7 @@ families! {
         |t| {
             let toe = e / f;
             let part = |t: T| {
-                t * (a * t * (T::of(1.0) - toe) + b * (c - toe)) / ((a * t + b) * t + d * f)
+                t * (a * t * (T::from_f64(1.0) - toe) + b * (c - toe)) / ((a * t + b) * t + d * f)
             };
             part(t) / part(w)
         };
@@ -400,7 +400,7 @@ families! {
             // q and t0 have the same effect on the curve.
             identifiable: false,
         },
-        |t| l * (T::of(1.0) + q * (-k * (t - t0)).exp()).power(-T::of(1.0) / nu);
+        |t| l * (T::from_f64(1.0) + q * (-k * (t - t0)).exp()).power(-T::from_f64(1.0) / nu);
 
     Tanh = CURVE_TANH: "tanh",
         "delta0 + (1 - delta0) tanh(g t), g = g0 + c Y",

@@ -4,10 +4,10 @@ use std::fs::File;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use super::{Layout, Writer, comment_lines};
+use super::{PlyLayout, Writer, comment_lines};
 use crate::base::output::write_whole_with;
-use crate::base::ply::Header;
-use crate::splats::scene::{Facts, Gaussians, Shape};
+use crate::base::ply::PlyHeader;
+use crate::splats::scene::{Gaussians, ModelFacts, Shape};
 use crate::{Error, Result};
 
 /// The Gaussians of a part: 15 MB of degree 3.
@@ -20,7 +20,7 @@ const LONGEST_HEADER: u64 = 1 << 26;
 pub(crate) struct PartFile {
     path: PathBuf,
     file: File,
-    layout: Layout,
+    layout: PlyLayout,
     /// Gaussians of a part.
     part: usize,
 }
@@ -42,19 +42,19 @@ impl PartFile {
             if !start.starts_with(b"ply") {
                 return Ok(None);
             }
-            match Header::parse(&start) {
+            match PlyHeader::parse(&start) {
                 Ok(header) => break header,
                 Err(_) if read < length.min(LONGEST_HEADER) => read *= 2,
                 Err(problem) => return Err(Error::input(path, problem)),
             }
         };
-        let layout = Layout::of(&header, length - header.length as u64);
+        let layout = PlyLayout::new(&header, length - header.length as u64);
         let layout = layout.map_err(|problem| Error::input(path, problem))?;
         Ok(Some(Self { path: path.to_owned(), file, layout, part }))
     }
 
     /// What the header states.
-    pub(crate) fn facts(&self) -> &Facts {
+    pub(crate) fn facts(&self) -> &ModelFacts {
         &self.layout.facts
     }
 
@@ -68,7 +68,7 @@ impl PartFile {
 
     /// All Gaussians, a part at a time and in order.
     pub(crate) fn read(&self, mut take: impl FnMut(Gaussians) -> Result<()>) -> Result<()> {
-        let Layout { count, stride, length, .. } = self.layout;
+        let PlyLayout { count, stride, length, .. } = self.layout;
         let cannot =
             |error: std::io::Error| Error::input(&self.path, format!("cannot be read: {error}"));
         let mut file = &self.file;

@@ -31,7 +31,7 @@ pub(super) const ALL: Terms = [true; TERMS];
 const BOUNDS: [f64; TERMS] = [4.0, 100.0, 1000.0, 0.5];
 
 /// The observations that are fitted to, in columns, with the range of each point's.
-pub(super) struct Rows {
+pub(super) struct LampObservations {
     view: Vec<usize>,
     /// log2 of the brightness.
     light: Vec<f64>,
@@ -45,14 +45,14 @@ pub(super) struct Rows {
 }
 
 /// Coefficients of the terms, and the exposure of each view that has observations.
-pub(super) struct Fit {
+pub(super) struct LampFit {
     pub(super) coefficients: [f64; TERMS],
     pub(super) exposures: Vec<Option<f64>>,
 }
 
-impl Rows {
+impl LampObservations {
     /// The unclipped observations of points that two views see.
-    pub(super) fn of(points: &[Vec<Observation>], views: usize) -> Result<Self, String> {
+    pub(super) fn new(points: &[Vec<Observation>], views: usize) -> Result<Self, String> {
         let clean = |point: &Vec<Observation>| -> Vec<Observation> {
             point.iter().copied().filter(|one| !one.is_clipped).collect()
         };
@@ -111,7 +111,7 @@ impl Rows {
     }
 
     /// Fits some terms and, if asked, exposures: Gauss-Newton steps within the bounds, with Huber's weights.
-    pub(super) fn fit(&self, terms: Terms, with_exposures: bool) -> Fit {
+    pub(super) fn fit(&self, terms: Terms, with_exposures: bool) -> LampFit {
         const LINEAR_ROUNDS: usize = 5;
         const ROUNDS: usize = 10;
         const HUBER: f64 = 1.5;
@@ -154,18 +154,18 @@ impl Rows {
                 *weight = (HUBER * scale / residual.abs().max(1e-9)).clamp(1e-6, 1.0);
             }
         }
-        Fit { coefficients, exposures: left(coefficients, &weights).1 }
+        LampFit { coefficients, exposures: left(coefficients, &weights).1 }
     }
 
     /// What a fit to other points leaves of the brightness, about the median of each point; without the views that
     /// have no exposure.
-    pub(super) fn residuals(&self, fit: &Fit) -> Vec<f64> {
+    pub(super) fn residuals(&self, fit: &LampFit) -> Vec<f64> {
         let lamp = self.lamp(fit.coefficients);
         let row = |row: usize| Some(self.light[row] - lamp[row] - fit.exposures[self.view[row]]?);
         let of_point = |rows: &Range<usize>| {
-            let known: Vec<f64> = rows.clone().filter_map(row).collect();
-            let middle = median(known.clone()).unwrap_or(0.0);
-            known.into_iter().map(move |one| one - middle)
+            let lights: Vec<f64> = rows.clone().filter_map(row).collect();
+            let middle = median(lights.clone()).unwrap_or(0.0);
+            lights.into_iter().map(move |one| one - middle)
         };
         self.groups.iter().flat_map(of_point).collect()
     }
@@ -232,9 +232,9 @@ impl Rows {
                 break;
             }
         }
-        let known = (0..self.views).filter(|&view| !unseen(view));
+        let seen = (0..self.views).filter(|&view| !unseen(view));
         let mean =
-            known.clone().map(|view| of_views[view]).sum::<f64>() / known.count().max(1) as f64;
+            seen.clone().map(|view| of_views[view]).sum::<f64>() / seen.count().max(1) as f64;
         let value = |view: usize| (!unseen(view)).then(|| of_views[view] - mean);
         (0..self.views).map(value).collect()
     }

@@ -18,12 +18,12 @@ pub(super) const PROPHOTO: [[f64; 2]; 4] =
 
 /// The curve of a colour space: sRGB's, or an exponent.
 #[derive(Clone, Copy)]
-pub(super) enum Encoding {
+pub(super) enum TransferFunction {
     Srgb,
     Power(f64),
 }
 
-impl Encoding {
+impl TransferFunction {
     pub(super) fn encode(self, linear: f64) -> f64 {
         match self {
             Self::Srgb if linear <= 0.003_130_8 => 12.92 * linear,
@@ -53,7 +53,7 @@ pub(super) fn to_d50([white, red, green, blue]: [[f64; 2]; 4]) -> DMat3 {
 }
 
 /// A linear sRGB colour encoded in another space.
-pub(super) fn encoded(linear: [f64; 3], space: [[f64; 2]; 4], curve: Encoding) -> [f64; 3] {
+pub(super) fn encoded(linear: [f64; 3], space: [[f64; 2]; 4], curve: TransferFunction) -> [f64; 3] {
     let seen = to_d50(space).inverse() * to_d50(SRGB) * DVec3::from_array(linear);
     seen.to_array().map(|value| curve.encode(value))
 }
@@ -66,10 +66,12 @@ fn xyz_tag(value: DVec3) -> Vec<u8> {
     [b"XYZ \0\0\0\0".to_vec(), value.to_array().map(fixed).concat()].concat()
 }
 
-fn curve_tag(curve: Encoding) -> Vec<u8> {
+fn curve_tag(curve: TransferFunction) -> Vec<u8> {
     let (kind, numbers) = match curve {
-        Encoding::Srgb => (3_u16, vec![2.4, 1.0 / 1.055, 0.055 / 1.055, 1.0 / 12.92, 0.04045]),
-        Encoding::Power(exponent) => (0, vec![exponent]),
+        TransferFunction::Srgb => {
+            (3_u16, vec![2.4, 1.0 / 1.055, 0.055 / 1.055, 1.0 / 12.92, 0.04045])
+        }
+        TransferFunction::Power(exponent) => (0, vec![exponent]),
     };
     let numbers: Vec<u8> = numbers.into_iter().flat_map(fixed).collect();
     [b"para\0\0\0\0".to_vec(), kind.to_be_bytes().to_vec(), vec![0; 2], numbers].concat()
@@ -102,7 +104,7 @@ fn name_tag(name: &str) -> Vec<u8> {
 }
 
 /// A profile of a matrix and a curve.
-pub(super) fn matrix_profile(space: [[f64; 2]; 4], curve: Encoding) -> Vec<u8> {
+pub(super) fn matrix_profile(space: [[f64; 2]; 4], curve: TransferFunction) -> Vec<u8> {
     let columns = to_d50(space);
     profile(
         b"RGB ",
@@ -120,7 +122,7 @@ pub(super) fn matrix_profile(space: [[f64; 2]; 4], curve: Encoding) -> Vec<u8> {
 }
 
 /// A grey profile with a curve.
-pub(super) fn grey_profile(curve: Encoding) -> Vec<u8> {
+pub(super) fn grey_profile(curve: TransferFunction) -> Vec<u8> {
     profile(b"GRAY", &[(b"desc", name_tag("grey")), (b"kTRC", curve_tag(curve))])
 }
 

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::layout::Layout;
+use super::layout::DatasetLayout;
 use super::{Dataset, View};
 use crate::camera::{Camera, TrainingFrame, frame, upwards};
 
@@ -11,13 +11,13 @@ impl Dataset {
     /// If all are at one position, half of the points are within it; without points it is 1.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn extent(&self) -> f64 {
-        self.place().1
+        self.center_and_extent().1
     }
 
     /// The coordinate frame of training.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn frame(&self) -> TrainingFrame {
-        let (center, extent) = self.place();
+        let (center, extent) = self.center_and_extent();
         TrainingFrame::new(center, extent)
     }
 
@@ -29,12 +29,12 @@ impl Dataset {
         let cameras: Vec<Camera> = self.train_views().map(View::upright_camera).collect();
         let up = upwards(&cameras);
         let has_convention =
-            Layout::of(&self.root).is_ok_and(|layout| !layout.listings().is_empty());
+            DatasetLayout::detect(&self.root).is_ok_and(|layout| !layout.listings().is_empty());
         if has_convention && up.z > MIN_COSINE { DVec3::Z } else { up }
     }
 
     /// The mean position of the training cameras, and the extent.
-    fn place(&self) -> (DVec3, f64) {
+    fn center_and_extent(&self) -> (DVec3, f64) {
         let centers = self.train_views().map(|view| view.camera.center());
         let (center, spread) = frame::spread(&centers.collect::<Vec<DVec3>>());
         if spread > 0.0 {
@@ -53,7 +53,7 @@ impl Dataset {
     /// their Gaussians would not stay finite.
     pub(super) fn leave_out_far_points(&mut self) {
         const MAX_EXTENTS: f64 = 1e6;
-        let (center, extent) = self.place();
+        let (center, extent) = self.center_and_extent();
         let before = self.points.len();
         // A positive condition: it is false for NaN.
         self.points.retain(|point| point.position.distance(center) <= MAX_EXTENTS * extent);
@@ -69,7 +69,7 @@ impl Dataset {
 
     /// Warns about training cameras far from all others.
     pub(super) fn warn_of_other_worlds(&self) {
-        let (center, extent) = self.place();
+        let (center, extent) = self.center_and_extent();
         for view in self.train_views() {
             let camera = view.camera.center();
             if frame::stands_elsewhere(camera, center, extent) {

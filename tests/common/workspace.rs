@@ -8,14 +8,14 @@ use nightsplat::photographs::dataset::synthetic;
 use super::train::small_set;
 
 /// A folder with a dataset of nine small views in `set`, and runs next to it.
-pub(crate) struct Place(pub(crate) tempfile::TempDir);
+pub(crate) struct Workspace(pub(crate) tempfile::TempDir);
 
-impl Place {
+impl Workspace {
     pub(crate) fn new() -> Self {
-        let place = Self(tempfile::tempdir().unwrap());
+        let workspace = Self(tempfile::tempdir().unwrap());
         let options = small_set(9, [40, 30], 2);
-        synthetic::write(place.path("set"), &options).unwrap();
-        place
+        synthetic::write(workspace.path("set"), &options).unwrap();
+        workspace
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {
