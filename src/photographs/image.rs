@@ -11,6 +11,8 @@ mod codec;
 #[cfg(feature = "io")]
 mod colour;
 #[cfg(feature = "io")]
+mod decoded;
+#[cfg(feature = "io")]
 mod exif;
 #[cfg(feature = "io")]
 mod exr_file;

@@ -25,7 +25,9 @@ fn defined_type(line: &str) -> Option<&str> {
         word.starts_with("pub") || word.starts_with("crate::") || *word == "unsafe"
     });
     let is_type = ["struct", "enum", "trait", "union"].contains(&words.next()?);
-    is_type.then(|| words.next()?.split(|letter: char| !letter.is_alphanumeric()).next())?
+    // A macro's is named by its arguments.
+    let name = words.next().filter(|name| is_type && !name.starts_with('$'))?;
+    name.split(|letter: char| !letter.is_alphanumeric()).next()
 }
 
 /// Whether a line of code defines a constructor `of`, or binds a vague name.

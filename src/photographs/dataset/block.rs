@@ -8,7 +8,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use super::Point;
-use super::listing::ViewEntry;
+use super::listed::ViewEntry;
 use crate::base::{input, output, tree};
 use crate::{Error, Result};
 

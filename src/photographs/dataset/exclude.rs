@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glob::Pattern;
 
-use super::listing::ViewEntry;
+use super::listed::ViewEntry;
 use crate::base::input;
 use crate::photographs::image::files::stem;
 use crate::{Error, Result};

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use super::DARK_FOLDERS;
-use super::listing::Listing;
+use super::listed::Listing;
 use super::names::below_first;
 use crate::base::tree;
 use crate::photographs::image::MaskFile;

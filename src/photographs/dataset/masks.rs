@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use super::listing::ViewEntry;
+use super::listed::ViewEntry;
 use crate::photographs::image::MaskFile;
 use crate::photographs::image::files::PhotographFiles;
 

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use super::listing::ViewEntry;
+use super::listed::ViewEntry;
 pub(super) use crate::photographs::image::files::normalized;
 use crate::photographs::image::files::stem;
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::listing::ViewEntry;
+use super::listed::ViewEntry;
 use super::{LoadOptions, Split, names};
 use crate::Result;
 use crate::base::{input, tree};

@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use super::layout::DatasetLayout;
-use super::listing::{Listing, select};
+use super::listed::Listing;
+use super::listing::select;
 use super::{Dataset, LoadOptions, sources};
 use crate::Result;
 use crate::base::hash::{self, Hasher};

@@ -16,7 +16,7 @@ use serde_json::{Map, Value};
 use self::intrinsics::Intrinsics;
 use self::keys::Unsupported;
 use self::matrix::Rows;
-use super::listing::{Listing, ViewEntry};
+use super::listed::{Listing, ViewEntry};
 use super::locate::{self, Wanted};
 use super::ply::Cloud;
 use super::{Split, names};

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::listing::ViewEntry;
+use super::listed::ViewEntry;
 use super::masks;
 use crate::base::tree;
 use crate::photographs::image::files::{photographs_in, unread_in};

@@ -82,7 +82,7 @@ pub(super) fn split<'a, P>(
     let count = pairs.len().min(folds);
     if count < 2 {
         return Err(Error::Usage(format!(
-            "{} pairs in {folds} folds leave none to fit to or none to validate on; use at least two pairs in two folds",
+            "{} pairs in {folds} folds leave none to fit or none to validate; use at least two pairs in two folds",
             pairs.len()
         )));
     }

@@ -10,10 +10,11 @@ use ::image::{
 };
 
 use super::colour::{self, ColourCounts};
+use super::decoded::{DecodedImage, Meaning};
 #[cfg(not(feature = "raw"))]
 use super::files::RAW_REMEDY;
 use super::files::{HEIC_REMEDY, is_raw};
-use super::source::{BufReadSeek, DecodedImage, Meaning, not_an_image, reader};
+use super::source::{BufReadSeek, not_an_image, reader};
 use super::{Image, Orientation, budget, exr_file, from_interleaved, jpeg, linear_from_srgb};
 use crate::base::output::write_whole;
 use crate::base::{input, tree};

@@ -7,7 +7,8 @@ use exr::meta::attribute::AttributeValue;
 use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableImage};
 
 use super::colour::{self, Chromaticities, Conversion};
-use super::source::{BufReadSeek, DecodedImage, Meaning, not_an_image};
+use super::decoded::{DecodedImage, Meaning};
+use super::source::{BufReadSeek, not_an_image};
 use super::{Image, srgb_from_linear};
 use crate::base::output::write_whole;
 use crate::{Error, Result};

@@ -1,12 +1,10 @@
-//! Image files before and after decoding, and the error for bytes that are not an image.
+//! Image files before decoding, and the error for bytes that are not an image.
 
 use std::io::{BufRead, Seek};
 use std::path::Path;
 
 use ::image::ImageReader;
 
-use super::Image;
-use super::colour::Conversion;
 use crate::Error;
 
 /// A file or memory as one type: decoders are compiled for each type that they read from.
@@ -28,27 +26,4 @@ pub(super) fn not_an_image(path: &Path, error: &dyn std::error::Error) -> Error 
         "is not a readable PNG, JPEG, WebP, TIFF or EXR image ({error}); replace or remove it"
     );
     Error::input(path, problem)
-}
-
-/// The meaning of the values of a file.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Meaning {
-    /// Colours, which are converted to sRGB.
-    Colour,
-    /// Other values, such as depth or a mask, which are kept as stored.
-    Number,
-}
-
-/// The contents of a file.
-pub(super) struct DecodedImage {
-    pub(super) image: Image,
-    pub(super) alpha: Option<Image>,
-    pub(super) conversion: Conversion,
-}
-
-impl DecodedImage {
-    /// Values that are not colours, or are sRGB already.
-    pub(super) fn as_stored(image: Image, alpha: Option<Image>) -> Self {
-        Self { image, alpha, conversion: Conversion::default() }
-    }
 }
