@@ -78,15 +78,19 @@ fn points_that_no_device_represents_and_views_that_show_nothing_are_reported() {
 
     let set = copied_set();
     edit_listing(&set, |listing| {
-        // The second view looks the opposite way: the x and z axes are negated. The third is far away.
+        // The second view looks the opposite way: the x and z axes are negated.
         let matrix = listing["frames"][1]["transform_matrix"].as_array_mut().unwrap();
         for (row, column) in (0..3).flat_map(|row| [(row, 0), (row, 2)]) {
             matrix[row][column] = Value::from(-matrix[row][column].as_f64().unwrap());
         }
+    });
+    trains_and_says(set.path(), "--plan none", &["view 002 contains none"]);
+
+    let set = copied_set();
+    edit_listing(&set, |listing| {
         listing["frames"][2]["transform_matrix"][0][3] = Value::from(1e300);
     });
-    let parts = ["view 002 contains none", "view 003 stands", "check its pose"];
-    trains_and_says(set.path(), "--plan none", &parts);
+    trains_and_says(set.path(), "--plan none", &["view 003 stands", "check its pose"]);
 }
 
 #[test]
