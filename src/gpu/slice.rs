@@ -125,11 +125,6 @@ impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
         self.len
     }
 
-    /// The name of the buffer.
-    pub fn name(&self) -> &str {
-        self.memory.name()
-    }
-
     /// The same elements to read, while this is not used.
     pub fn as_slice(&self) -> Slice<'_, T> {
         let Self { memory, first, len, .. } = *self;

@@ -67,23 +67,26 @@ pub fn counted<'a>(render: &'a Image, reference: &Image, mask: Option<&Mask>) ->
 }
 
 /// Peak signal-to-noise ratio over all pixels and channels, dB; infinite for equal images.
+#[cfg(feature = "testing")]
 pub fn psnr(render: &Image, reference: &Image) -> Result<f64> {
     psnr_of_counted(render, reference, None)
 }
 
-/// [`psnr`] of the unmasked pixels.
+/// Peak signal-to-noise ratio of the unmasked pixels over all channels, dB; infinite for equal images.
 pub fn psnr_of_counted(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<f64> {
     let mask = mask.map(|mask| mask.resized(render.width, render.height));
     Ok(decibels(mean(&errors(render, reference, mask.as_deref())?)))
 }
 
 /// The mean of the PSNRs of the three channels, dB: as the paper's code computes it, never below [`psnr`].
+#[cfg(feature = "testing")]
 pub fn psnr_channel_mean(render: &Image, reference: &Image) -> Result<f64> {
     Ok(mean(&errors(render, reference, None)?.map(decibels)))
 }
 
 /// Mean structural similarity over all pixels and channels (Wang et al. 2004): an 11x11 Gaussian window with sigma 1.5
 /// and zero padding, C1 = 0.01^2, C2 = 0.03^2, as in 3DGS.
+#[cfg(feature = "testing")]
 pub fn ssim(render: &Image, reference: &Image) -> Result<f64> {
     mean_ssim(render, reference, None)
 }
