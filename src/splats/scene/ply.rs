@@ -2,10 +2,10 @@
 //!
 //! Binary little-endian, one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`.
 //! Positions far from the world's origin are relative to another origin, given in a comment: `world = position + X Y
-//! Z`. Other comments state the settings of a renderer, such as `nightsplat near 0.1`: [`ModelFacts`]. Features, if any, are
-//! between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`, which viewers skip. Normals are
-//! zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid, scales are
-//! logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
+//! Z`. Other comments state the settings of a renderer, such as `nightsplat near 0.1`: [`ModelFacts`]. Features, if
+//! any, are between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`, which viewers skip.
+//! Normals are zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid,
+//! scales are logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
 
 #[cfg(feature = "io")]
 pub(crate) mod parts;
