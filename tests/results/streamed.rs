@@ -120,9 +120,9 @@ fn the_index_finds_every_gaussian_of_every_level_once_and_chunks_are_our_levels(
             .collect();
         assert!(errors.len() == 3 && errors[0] == 0.0 && errors.is_sorted(), "{errors:?}");
         for (level, found) in found.iter_mut().enumerate() {
-            let workspace = &leaf["lods"][level.to_string()];
+            let entry = &leaf["lods"][level.to_string()];
             let [file, offset, count] =
-                ["file", "offset", "count"].map(|key| workspace[key].as_u64().unwrap() as usize);
+                ["file", "offset", "count"].map(|key| entry[key].as_u64().unwrap() as usize);
             let name = names[file].as_str().unwrap();
             assert!(name.starts_with(&format!("{level}_")), "{name}");
             assert_eq!(offset, ends[file], "{name}: a gap");

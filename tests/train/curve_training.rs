@@ -84,8 +84,8 @@ fn exposure(
 ) -> nightsplat::Result<TargetExposure> {
     let mut dataset = dataset.clone();
     let training = dataset.views.iter_mut().filter(|view| view.is_train());
-    for (workspace, image) in training.filter_map(|view| view.image.as_mut()).enumerate() {
-        image.data.iter_mut().for_each(|x| *x = (*x * factors(workspace)).min(1.0));
+    for (index, image) in training.filter_map(|view| view.image.as_mut()).enumerate() {
+        image.data.iter_mut().for_each(|x| *x = (*x * factors(index)).min(1.0));
     }
     let trainer = Trainer::new(&gpu(), config(ToneSettings::default()), &dataset)?;
     Ok(trainer.scene().target_exposure(&dataset).unwrap())
@@ -96,7 +96,7 @@ fn darker_views_get_more_gain_and_the_model_the_mean_of_them() {
     let dataset = crate::common::train::dataset(6, [32, 24]);
     let uniform = exposure(&dataset, |_| 1.0).unwrap();
     assert_eq!(uniform.gains.len(), 5);
-    let varied = exposure(&dataset, |workspace| [1.0, 0.5, 0.25, 2.0, 1.0][workspace]).unwrap();
+    let varied = exposure(&dataset, |index| [1.0, 0.5, 0.25, 2.0, 1.0][index]).unwrap();
     for ((name, gain), factor) in varied.gains.iter().zip([1.0, 0.5, 0.25, 2.0, 1.0]) {
         // The scene's gain follows its brightest views, to which each view contributes.
         let ratio = gain * factor / uniform.gains[name];
@@ -123,13 +123,13 @@ fn unusual_datasets_have_a_defined_brightness_or_a_clear_error() {
     let one = exposure(&single, |_| 1.0).unwrap();
     assert!((one.model_gain / one.scene.gain - 1.0).abs() < 1e-9 && one.scene.spread == 0.0);
     // Black views among usable ones are left out of the measurement and use the scene's gain.
-    let with_black = exposure(&dataset, |workspace| if workspace < 2 { 0.0 } else { 1.0 }).unwrap();
+    let with_black = exposure(&dataset, |index| if index < 2 { 0.0 } else { 1.0 }).unwrap();
     assert_eq!(with_black.scene.black, 2);
     assert_eq!(with_black.gains.values().next(), Some(&with_black.scene.gain));
     let error = exposure(&dataset, |_| 0.0).unwrap_err().to_string();
     assert!(error.contains("almost black") && !error.contains('\n'), "{error}");
     // Half of them well lit, then all.
-    let half = exposure(&dataset, |workspace| if workspace % 2 == 0 { 8.0 } else { 1.0 }).unwrap();
+    let half = exposure(&dataset, |index| if index % 2 == 0 { 8.0 } else { 1.0 }).unwrap();
     assert!(half.scene.share > 0.9, "{half:?}");
     let well_lit = exposure(&dataset, |_| 9.0).unwrap();
     assert_eq!(well_lit.scene.weight(), 0.0, "{}", well_lit.scene.reason());

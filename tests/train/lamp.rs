@@ -43,24 +43,20 @@ fn lamp() -> Lamp {
 fn walls() -> (Vec<DVec3>, Vec<Vec3>) {
     let draws = Stream::new(7, 1);
     let number = |i: u64, k: u64| draws.uniform(6 * i + k);
-    let workspace = |i: u64| {
+    let on_wall = |i: u64| {
         let inside = DVec3::new(number(i, 0), number(i, 1), number(i, 2)) * 2.0 - 1.0;
         let (wall, side) = ((number(i, 3) * 2.4) as usize, 2.0 * (i % 2) as f64 - 1.0);
-        let mut workspace = inside * HALF;
-        workspace[wall] = side * HALF[wall];
-        workspace
+        let mut point = inside * HALF;
+        point[wall] = side * HALF[wall];
+        point
     };
-    let places: Vec<DVec3> = (0..1500).map(workspace).collect();
-    let tint = |workspace: &DVec3| {
+    let points: Vec<DVec3> = (0..1500).map(on_wall).collect();
+    let tint = |point: &DVec3| {
         let wave = |at: f64| (0.55 + 0.35 * (3.0 * at).sin()) as f32;
-        Vec3::new(
-            wave(workspace.x + workspace.z),
-            wave(workspace.y - workspace.z),
-            wave(workspace.x - workspace.y),
-        )
+        Vec3::new(wave(point.x + point.z), wave(point.y - point.z), wave(point.x - point.y))
     };
-    let colors = places.iter().map(tint).collect();
-    (places, colors)
+    let colors = points.iter().map(tint).collect();
+    (points, colors)
 }
 
 /// Cameras along the gallery that look along it, one way or the other, and a bit aside.
@@ -68,7 +64,7 @@ fn camera(view: usize) -> Camera {
     let draws = Stream::new(9, 2);
     let number = |k: u64| 2.0 * draws.uniform(4 * view as u64 + k) - 1.0;
     let along = if view.is_multiple_of(2) { 0.0 } else { std::f64::consts::PI };
-    let workspace = DVec3::new(0.4 * number(0), 0.3 * number(1), 2.8 * number(2));
+    let point = DVec3::new(0.4 * number(0), 0.3 * number(1), 2.8 * number(2));
     let turn = DMat3::from_rotation_y(along + 0.6 * number(3));
     let rotation = turn.transpose();
     Camera {
@@ -77,15 +73,15 @@ fn camera(view: usize) -> Camera {
         focal: DVec2::splat(44.0),
         principal_point: DVec2::new(32.0, 24.0),
         model: CameraModel::Pinhole,
-        view_from_world: DAffine3 { matrix3: rotation, translation: -(rotation * workspace) },
+        view_from_world: DAffine3 { matrix3: rotation, translation: -(rotation * point) },
     }
 }
 
 /// Photographs of the gallery in the light of the lamp, and the same views in even light.
 fn photographed() -> (Dataset, Vec<Image>) {
-    let (gpu, (places, colors)) = (gpu(), walls());
+    let (gpu, (points, colors)) = (gpu(), walls());
     let start = Initialization { opacity: 0.95, scale: 1.0, ..Initialization::default() };
-    let gaussians = Gaussians::from_points(&places, &colors, 0, &start, 1).unwrap();
+    let gaussians = Gaussians::from_points(&points, &colors, 0, &start, 1).unwrap();
     let on_device = gaussians.upload(&gpu).unwrap();
     let render = |lamp: Option<Lamp>| -> Vec<Image> {
         let settings = RenderSettings { shape: 0.into(), lamp, near: 0.05, ..Default::default() };
@@ -105,15 +101,15 @@ fn photographed() -> (Dataset, Vec<Image>) {
     };
     let views: Vec<View> = lit.into_iter().enumerate().map(view).collect();
     // Those that see a point are near it: the others see a wall before it.
-    let is_near = |view: &View, workspace: DVec3| view.camera.center().distance(workspace) < 3.0;
-    let seen = |workspace: DVec3| {
+    let is_near = |view: &View, point: DVec3| view.camera.center().distance(point) < 3.0;
+    let seen = |point: DVec3| {
         let sees = |(index, view): (usize, &View)| {
-            let is_seen = view.camera.sees(workspace).is_some() && is_near(view, workspace);
+            let is_seen = view.camera.sees(point).is_some() && is_near(view, point);
             is_seen.then_some(index as u32)
         };
         views.iter().enumerate().filter_map(sees).collect()
     };
-    let points = places.iter().map(|&position| Point { position, views: seen(position) });
+    let points = points.iter().map(|&position| Point { position, views: seen(position) });
     let points = points.collect();
     (Dataset { root: "gallery".into(), views, points, skipped: vec![] }, even)
 }
