@@ -343,11 +343,11 @@ fn a_run_has_one_colour_in_every_chart_and_its_name_next_to_its_last_point() {
     assert!(!drawn.contains("lost"), "{drawn}");
     assert!(drawn.contains("the run &lt;fast&gt;") && !drawn.contains("NaN"), "{drawn}");
     // Two names at one place do not overlap.
-    let workspace = |name: &str| {
+    let attributes = |name: &str| {
         let before = drawn.split(&format!(">{name}</text>")).next().unwrap();
         before.rsplit("<text ").next().unwrap().to_owned()
     };
-    assert_ne!(workspace("fast").split(" class").next(), workspace("2").split(" class").next());
+    assert_ne!(attributes("fast").split(" class").next(), attributes("2").split(" class").next());
     let curve = svg(vec![series("a", 0, &[(1.0, 20.0), (9.0, 25.0)])]);
     assert_eq!((curve.matches("<polyline").count(), curve.matches("<path").count()), (1, 0));
     for points in [&[][..], &[(0.0, 1.0)], &[(-1.0, 2.0)], &[(1e-300, 1e300)]] {
