@@ -181,10 +181,16 @@ fn overview(gaussians: &Gaussians) -> Camera {
 fn points(dataset: &Dataset) -> crate::Result<Gaussians> {
     const GREY: Vec3 = Vec3::splat(0.6);
     let origin = dataset.frame().file_origin();
-    let places: Vec<DVec3> = dataset.points.iter().map(|point| point.position - origin).collect();
+    let positions: Vec<DVec3> =
+        dataset.points.iter().map(|point| point.position - origin).collect();
     let start = Initialization { opacity: 0.9, scale: 0.3, ..Initialization::default() };
-    let mut gaussians =
-        Gaussians::from_points(&places, &vec![GREY; places.len()], Shape::default(), &start, 0)?;
+    let mut gaussians = Gaussians::from_points(
+        &positions,
+        &vec![GREY; positions.len()],
+        Shape::default(),
+        &start,
+        0,
+    )?;
     gaussians.origin = origin;
     Ok(gaussians)
 }

@@ -33,7 +33,7 @@ fn updates(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<U
     let camera = ReferenceCamera::from(&cameras[params.camera_index as usize]);
     let left_out = frozen_floats(frozen_columns, count);
     let of_gaussian = |i: usize| {
-        let numbers: Vec<usize> = layout.places(i).collect();
+        let numbers: Vec<usize> = layout.indices(i).collect();
         let planes = planes(layout.feature_count, numbers.len());
         let before_rest = planes[Attribute::Rest as usize].column;
         let mean = DVec3::from_array([0, 1, 2].map(|axis| parameters[numbers[axis]].into()));

@@ -86,7 +86,7 @@ impl Planes {
     }
 
     /// The indices of the floats of Gaussian `i`, in the order of [`Gaussian`].
-    pub(super) fn places(self, i: usize) -> impl Iterator<Item = usize> {
+    pub(super) fn indices(self, i: usize) -> impl Iterator<Item = usize> {
         let Self { count, feature_count, sh_degree, rest_by_column } = self;
         let columns = column_count(feature_count, sh_degree);
         Words { count, feature_count, columns, rest_by_column }.of_gaussian(i)
@@ -114,7 +114,7 @@ impl Planes {
 
     /// Gaussian `i` of the array.
     pub fn load<T: Copy + Into<f64>>(self, parameters: &[T], i: usize) -> Gaussian {
-        let v: Vec<f64> = self.places(i).map(|at| parameters[at].into()).collect();
+        let v: Vec<f64> = self.indices(i).map(|at| parameters[at].into()).collect();
         let planes = planes(self.feature_count, v.len());
         let of = |attribute: Attribute| {
             let AttributePlane { column, width, .. } = planes[attribute as usize];
@@ -143,7 +143,7 @@ impl Planes {
             .chain(sh(0..1))
             .chain(gaussian.features.iter().copied())
             .chain(sh(1..gaussian.sh.len()));
-        self.places(i).zip(values).for_each(|(at, value)| set(at, value));
+        self.indices(i).zip(values).for_each(|(at, value)| set(at, value));
     }
 }
 

@@ -121,17 +121,17 @@ pub fn coarser(gaussians: &Gaussians) -> (Gaussians, f64) {
 /// A level of a model whose tiles have these numbers of Gaussians, tile by tile in cells of at most `most`; level 0 is
 /// the model, cell by cell.
 pub fn level(gaussians: &Gaussians, tiles: &[usize], most: usize, level: usize) -> Gaussians {
-    let (mut places, mut start): (Vec<Vec<u32>>, usize) = (vec![], 0);
+    let (mut indices, mut start): (Vec<Vec<u32>>, usize) = (vec![], 0);
     for &count in tiles.iter().filter(|count| **count > 0) {
         let Cells { order, cells } = Cells::new(&gaussians.means()[start..][..count], most);
         let of_cell =
             |cell: Range<usize>| order[cell].iter().map(move |index| index + start as u32);
-        places.extend(cells.into_iter().map(|cell| of_cell(cell).collect()));
+        indices.extend(cells.into_iter().map(|cell| of_cell(cell).collect()));
         start += count;
     }
     let of_cell =
         |cell: &Vec<u32>| (0..level).fold(gaussians.select(cell), |index, _| coarser(&index).0);
-    let cells: Vec<Gaussians> = places.par_iter().map(of_cell).collect();
+    let cells: Vec<Gaussians> = indices.par_iter().map(of_cell).collect();
     Gaussians::concatenated(&cells.iter().collect::<Vec<_>>())
 }
 

@@ -64,15 +64,15 @@ impl Initial {
 
 /// Removes the Gaussians outside the halo, and returns those of them that a camera sees.
 fn around(gaussians: &mut Gaussians, halo: &Cell, cameras: &[Camera]) -> Gaussians {
-    let places = 0..gaussians.count;
+    let indices = 0..gaussians.count;
     let is_own: Vec<bool> =
-        places.clone().map(|index| halo.contains(gaussians.position(index))).collect();
+        indices.clone().map(|index| halo.contains(gaussians.position(index))).collect();
     let is_seen = |index: usize| {
         let position = gaussians.position(index);
         let sees = |camera: &Camera| camera.sees_within(position, MARGIN).is_some();
         !is_own[index] && cameras.iter().any(sees)
     };
-    let is_context: Vec<bool> = places.into_par_iter().map(is_seen).collect();
+    let is_context: Vec<bool> = indices.into_par_iter().map(is_seen).collect();
     let mut context = gaussians.clone();
     context.retain(&is_context);
     gaussians.retain(&is_own);

@@ -190,14 +190,14 @@ fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
     /// Darker targets do not determine the illumination.
     const DARKEST: f32 = 1.0 / 255.0;
     let features = gaussians.shape.features;
-    let places = |feature| {
+    let indices = |feature| {
         let channels = features.channels_of(feature).unwrap_or_default();
         channels.map(|channel| channel - COLOR_CHANNELS)
     };
     let width = features.width();
     for (i, of_gaussian) in gaussians.features_mut().chunks_mut(width.max(1)).enumerate() {
-        places(Feature::Structure).for_each(|at| of_gaussian[at] = 0.0);
-        for (channel, at) in places(Feature::Illumination).enumerate() {
+        indices(Feature::Structure).for_each(|at| of_gaussian[at] = 0.0);
+        for (channel, at) in indices(Feature::Illumination).enumerate() {
             of_gaussian[at] = (low[i][channel] / colors[i][channel].max(DARKEST)).clamp(0.0, 1.0);
         }
     }

@@ -262,14 +262,14 @@ impl Views {
         const AT_ONCE: usize = 256;
         let gpu = pseudo_gt.gpu();
         let white = gpu.buffer("white", &[1.0; COLOR_CHANNELS])?;
-        let places: Vec<usize> = (0..self.curves.len()).collect();
+        let indices: Vec<usize> = (0..self.curves.len()).collect();
         let mut whites = vec![];
-        for places in places.chunks(AT_ONCE) {
+        for indices in indices.chunks(AT_ONCE) {
             let target = |_| gpu.uninit("white_target", COLOR_CHANNELS);
-            let mut targets = places.iter().map(target).collect::<Result<Vec<_>>>()?;
+            let mut targets = indices.iter().map(target).collect::<Result<Vec<_>>>()?;
             let mut downloads = vec![];
             gpu.run("pseudo-GT", |pass| {
-                for (&photograph_index, target) in places.iter().zip(&mut targets) {
+                for (&photograph_index, target) in indices.iter().zip(&mut targets) {
                     pseudo_gt.map(pass, &white, &self.curves, photograph_index as u32, target)?;
                     downloads.push(pass.download(&*target)?);
                 }

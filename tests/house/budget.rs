@@ -15,7 +15,7 @@ const BUDGET: &[(&str, usize, &str)] = &[
     ("src/blocks", 1379, "Scenes that outgrow a device, in parts."),
     ("src/camera", 2111, "Cameras, their models, patches and paths."),
     ("src/capi", 1701, "The interface in C."),
-    ("src/cli", 9721, "Arguments and text of the commands."),
+    ("src/cli", 9727, "Arguments and text of the commands."),
     ("src/gpu", 6545, "Vulkan: devices, buffers, passes, and what hosts lend."),
     ("src/loss", 2053, "The terms of the loss."),
     ("src/networks", 2638, "Denoiser, tonemapper, structure and LPIPS."),

@@ -54,15 +54,15 @@ impl Gaussians {
 
     /// These Gaussians, in this order.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn select(&self, places: &[u32]) -> Self {
-        let mut some = Self::zeros(places.len(), self.shape);
+    pub(crate) fn select(&self, indices: &[u32]) -> Self {
+        let mut some = Self::zeros(indices.len(), self.shape);
         some.origin = self.origin;
         for spec in &ATTRIBUTES {
             let from = &self.parameters[self.plane(spec.attribute)];
             let width = from.len() / self.count.max(1);
             let plane = some.plane(spec.attribute);
             let rows = some.parameters[plane].chunks_exact_mut(width.max(1));
-            for (to, &index) in rows.zip(places) {
+            for (to, &index) in rows.zip(indices) {
                 to.copy_from_slice(&from[width * index as usize..][..width]);
             }
         }
@@ -141,11 +141,11 @@ impl Gaussians {
         positions.par_iter().map(distance).collect()
     }
 
-    /// The places of the `COUNT` Gaussians nearest to each, itself among them; there can be fewer.
+    /// The indices of the `COUNT` Gaussians nearest to each, itself among them; there can be fewer.
     pub(crate) fn nearest_of_each<const COUNT: usize>(&self) -> Vec<Vec<u32>> {
         let positions: Vec<DVec3> = self.means().iter().map(|mean| mean.as_dvec3()).collect();
         let neighbours = Neighbours::new(positions.clone());
-        positions.iter().map(|position| neighbours.nearest_places::<COUNT>(*position)).collect()
+        positions.iter().map(|position| neighbours.nearest_indices::<COUNT>(*position)).collect()
     }
 
     /// Opacities after the sigmoid.

@@ -29,8 +29,8 @@ impl Neighbours {
         })
     }
 
-    /// The places of the nearest positions in the list that was given; there can be fewer.
-    pub(super) fn nearest_places<const COUNT: usize>(&self, point: DVec3) -> Vec<u32> {
+    /// The indices of the nearest positions in the list that was given; there can be fewer.
+    pub(super) fn nearest_indices<const COUNT: usize>(&self, point: DVec3) -> Vec<u32> {
         let found = self.find::<COUNT>(point).into_iter();
         found.filter_map(|(_, slot)| Some(self.positions.get(slot)?.1)).collect()
     }
@@ -101,9 +101,9 @@ mod tests {
                     let mut expected: Vec<f64> = squared.chain([f64::INFINITY; 4]).collect();
                     expected.sort_by(f64::total_cmp);
                     let found = tree.nearest::<4>(point);
-                    let places = tree.nearest_places::<4>(point);
-                    assert_eq!(places.len(), positions.len().min(4));
-                    for (index, (_, position)) in places.into_iter().zip(found) {
+                    let indices = tree.nearest_indices::<4>(point);
+                    assert_eq!(indices.len(), positions.len().min(4));
+                    for (index, (_, position)) in indices.into_iter().zip(found) {
                         assert_eq!(positions[index as usize], position, "{count}, {grid}");
                     }
                     assert_eq!(found.map(|(squared, _)| squared), expected[..4], "{count}, {grid}");
