@@ -32,7 +32,6 @@ fi
 echo "test programs, slowest first:"
 sort -rn "$NIGHTSPLAT_TIMES/programs"
 echo "the slowest tests:"
-# Not with `head`: it closes the pipe early, and `pipefail` makes a failure of that.
 sed -n 's/^test \(.*\) \.\.\. .*<\([0-9.]*\)s>$/\2 \1/p' "$NIGHTSPLAT_TIMES/tests" | sort -rn |
     awk 'NR <= 10 { printf "%8.1f s  %s\n", $1, $2 }'
 exit "$status"
