@@ -18,6 +18,21 @@ float within(float t) {
     return t > 0.0 ? min(t, LARGEST_T) : 0.0;
 }
 
+// The shoulder of the automatic curve: 1 - exp(-u) with u = ln(1 + s t) / s, or t for s = 0. constants[1] is s.
+float shoulder(float t, ToneParameters tone) {
+    float s = tone.constants[1];
+    return one_minus_exp(s > 0.0 ? log_1p(s * t) / s : t);
+}
+
+// The toe of the automatic curve: from the black level to 0, and from constants[2] to itself; constants[3] is its weight.
+float toe(float value, ToneParameters tone) {
+    float end = tone.constants[2];
+    float weight = tone.constants[3];
+    if (!(weight > 0.0 && value < end)) return value;
+    float s = (value - tone.offset) / (end - tone.offset);
+    return value + weight * (0.5 * end * s * (1.0 + s) - value);
+}
+
 float tone_curve(float x, ToneParameters tone) {
     float t = x / tone.white;
     float y;
@@ -26,8 +41,10 @@ float tone_curve(float x, ToneParameters tone) {
     case CURVE_LINEAR:
         y = t;
         break;
-    case CURVE_ASE:
     case CURVE_AUTO:
+        y = toe(tone.offset + (1.0 - tone.offset) * shoulder(t, tone), tone);
+        break;
+    case CURVE_ASE:
         y = tone.offset + (1.0 - tone.offset) * one_minus_exp(tone.gain * t);
         break;
     case CURVE_AP3:

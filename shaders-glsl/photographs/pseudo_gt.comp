@@ -45,10 +45,11 @@ float stored(uint i) {
 // 1.
 vec3 automatic(vec3 t, float y, ToneParameters tone) {
     float least = max(y, 1e-20);
-    float factor = one_minus_exp(least) / least;
-    vec3 toe = vec3(one_minus_exp(t.r), one_minus_exp(t.g), one_minus_exp(t.b));
+    float factor = shoulder(least, tone) / least;
+    vec3 soft = vec3(shoulder(t.r, tone), shoulder(t.g, tone), shoulder(t.b, tone));
     float share = tone.constants[0];
-    return tone.offset + (1.0 - tone.offset) * ((1.0 - share) * toe + share * (t * factor));
+    vec3 value = tone.offset + (1.0 - tone.offset) * ((1.0 - share) * soft + share * (t * factor));
+    return vec3(toe(value.r, tone), toe(value.g, tone), toe(value.b, tone));
 }
 
 // Written so that a NaN becomes black.

@@ -31,6 +31,8 @@ mod inverse;
 #[cfg(feature = "io")]
 mod mapping;
 #[cfg(feature = "io")]
+mod metering;
+#[cfg(feature = "io")]
 mod profile;
 mod real;
 mod scene_law;
@@ -48,7 +50,7 @@ pub(crate) use self::curve::{clamped, curve_at, tone_curve};
 #[cfg(feature = "io")]
 pub(crate) use self::exposure::all_black;
 #[cfg(feature = "io")]
-pub use self::exposure::{Exposure, exposure_knots, is_black, soft};
+pub use self::exposure::{Exposure, exposure_knots, is_black};
 pub use self::families::{Constant, FAMILIES, Family, ToneCurve, White};
 #[cfg(feature = "io")]
 pub use self::file::CurveChoice;
@@ -58,6 +60,10 @@ pub use self::histogram::LuminanceHistogram;
 pub use self::inverse::{InverseTone, Inverted};
 #[cfg(feature = "io")]
 pub use self::mapping::{MeasuredPhotograph, ToneMapping};
+#[cfg(feature = "io")]
+pub use self::metering::{CurveEnds, NEAR_WHITE, soft};
+#[cfg(feature = "check")]
+pub(crate) use self::metering::{shoulder, toe};
 #[cfg(feature = "io")]
 pub use self::profile::Profile;
 #[cfg(feature = "check")]

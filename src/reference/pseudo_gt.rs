@@ -5,7 +5,7 @@ use crate::kernels::curves::{
     CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_PROFILE, CURVE_TABLE,
 };
 use crate::kernels::pseudo_gt::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::{Real, interpolate, measurable, profiled};
+use crate::photographs::tone::{Real, interpolate, measurable, profiled, shoulder, toe};
 
 /// The stored code of a value.
 fn stored(code_bits: u32, slices: &Slices<'_>, i: usize) -> f32 {
@@ -27,9 +27,11 @@ fn mixed(curve: u32, rgb: [f32; 3], tone: &ToneParameters) -> [Rounded; 3] {
     let channel = |channel: usize| match curve {
         CURVE_AUTO => {
             let (t, y) = (rgb[channel] / white, (y / white).at_least(of(1e-20)));
-            let share = Rounded::exact(tone.constants[0]);
-            let kept = t * (y.one_minus_exp() / y);
-            offset + (one - offset) * ((one - share) * t.one_minus_exp() + share * kept)
+            let [share, bend, end, weight] =
+                [0, 1, 2, 3].map(|at| Rounded::exact(tone.constants[at]));
+            let kept = t * (shoulder(y, bend) / y);
+            let soft = (one - share) * shoulder(t, bend) + share * kept;
+            toe(offset + (one - offset) * soft, offset, [end, weight])
         }
         CURVE_LUM_PRESERVE => rgb[channel] * (y * gain / (y + of(1e-6))),
         _ => rgb[channel] * (one / Rounded::exact(tone.constants[channel])),

@@ -41,7 +41,7 @@ impl ViewExposures {
         };
         let Some(gain) = exposure.gains.get(view) else { return image };
         let weight = exposure.scene.weight.unwrap_or(1.0);
-        let knots = exposure_knots([exposure.model_gain, *gain], weight);
+        let knots = exposure_knots(&exposure.scene.ends, [exposure.model_gain, *gain], weight);
         for x in &mut image.data {
             let inside = x.clamp(knots[0][0], knots[knots.len() - 1][0]);
             let above = knots.partition_point(|knot| knot[0] <= inside).clamp(1, knots.len() - 1);

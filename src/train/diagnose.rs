@@ -380,7 +380,7 @@ fn target_noise(
     let encoded = f64::from(crate::photographs::image::srgb_from_linear(light as f32));
     let weight = exposure.weight();
     // The curve's slope at the photograph's mean; 1 without a curve.
-    let soft = |x: f64| crate::photographs::tone::soft(x, exposure.gain);
+    let soft = |x: f64| exposure.ends.soft(x, exposure.gain);
     let step = 1e-4;
     let slope = (soft(encoded + step) - soft(encoded - step)) / (2.0 * step);
     let slope = weight * slope + (1.0 - weight);

@@ -265,6 +265,10 @@ fn curves_that_mix_channels_match_their_reference() {
             (CURVE_PER_CHANNEL, plain),
             (CURVE_AUTO, automatic),
             (CURVE_AUTO, ToneParameters { white: 1.0 / 128.0, ..automatic }),
+            (
+                CURVE_AUTO,
+                ToneParameters { constants: [0.2, 1.5, 0.4, 0.7, 0.0, 0.0, 0.0, 0.0], ..automatic },
+            ),
         ] {
             mapped(curve, &image, tone, (&[], 0));
         }

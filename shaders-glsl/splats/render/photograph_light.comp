@@ -7,7 +7,7 @@
 //!
 //! Colours are weighted by alpha, so the colour before that is c / alpha. A curve that maps each value by itself is
 //! inverted by bisection. `auto` also depends on the luminance Y of the pixel, by s(Y) / Y: for a given Y, a channel is
-//! a concave curve, whose inverse Newton's method finds from the left; bracketed, it also finds the Y that its own
+//! a concave curve below a toe, whose inverse Newton's method finds from the left; bracketed, it also finds the Y that its own
 //! result has. Values within half a code of 8 bits of the largest that a curve gives become those of that limit. The
 //! host's inverse is `src/photographs/tone/inverse.rs`.
 
@@ -60,14 +60,31 @@ float bisected(float value, uint channel) {
     return 0.5 * (low + high);
 }
 
+// The derivative of the shoulder.
+float shoulder_slope(float t) {
+    float s = tone.constants[1];
+    return s > 0.0 ? exp(-log_1p(s * t) / s) / (1.0 + s * t) : exp(-t);
+}
+
+// The value that the toe maps to this one: value = a s^2 + b s + c has the increasing root s.
+float before_toe(float value) {
+    float end = tone.constants[2];
+    float weight = tone.constants[3];
+    if (!(weight > 0.0 && value < end)) return value;
+    float a = 0.5 * weight * end;
+    float b = a + (1.0 - weight) * (end - tone.offset);
+    float c = (1.0 - weight) * tone.offset - value;
+    return tone.offset - 2.0 * c / (b + sqrt(max(b * b - 4.0 * a * c, 0.0))) * (end - tone.offset);
+}
+
 // The value in units of white whose target is `value` where s(Y) / Y is `factor`, from a guess, and the slope there.
 vec2 solved(float value, float factor, float t) {
     float share = tone.constants[0];
     float slope = 1.0;
     for (uint trial = 0; trial < TRIALS; ++trial) {
-        float toe = (1.0 - share) * one_minus_exp(t) + share * (t * factor);
-        float y = tone.offset + (1.0 - tone.offset) * toe;
-        slope = (1.0 - tone.offset) * ((1.0 - share) * exp(-t) + share * factor);
+        float soft = (1.0 - share) * shoulder(t, tone) + share * (t * factor);
+        float y = tone.offset + (1.0 - tone.offset) * soft;
+        slope = (1.0 - tone.offset) * ((1.0 - share) * shoulder_slope(t) + share * factor);
         if (tone.weight < 1.0) {
             float x = t * tone.white;
             float plain = min(x, 1.0);
@@ -85,9 +102,11 @@ vec2 solved(float value, float factor, float t) {
 // s(Y) / Y, and its derivative.
 vec2 factor_at(float y) {
     float least = max(y, 1e-20);
-    float factor = one_minus_exp(least) / least;
+    float factor = shoulder(least, tone) / least;
     // The difference cancels for dark pixels.
-    float slope = least < 0.05 ? -0.5 + least / 3.0 - least * least / 8.0 : (exp(-least) - factor) / least;
+    float s = tone.constants[1];
+    float series = (1.0 + s) * (-0.5 + (1.0 + 2.0 * s) * least * (1.0 / 3.0 - (1.0 + 3.0 * s) * least / 8.0));
+    float slope = least < 0.05 ? series : (shoulder_slope(least) - factor) / least;
     return vec2(factor, slope);
 }
 
@@ -134,6 +153,7 @@ void main() {
         value = mix(vec3(0.0), min(value, largest), greaterThan(value, vec3(0.0)));
         // The curve of no light is the black level.
         float black = tone.weight < 1.0 ? tone.weight * tone.offset : tone.offset;
+        value = vec3(before_toe(value.r), before_toe(value.g), before_toe(value.b));
         light = automatic(max(value, vec3(black)));
     } else {
         light = vec3(bisected(value.r, 0), bisected(value.g, 1), bisected(value.b, 2));

@@ -60,7 +60,7 @@ impl SceneTone {
             return Err(wrong(format!("its version is {version}, this program reads {VERSION}")));
         }
         if let Some(exposure) = &mut exposure {
-            exposure.brightness = tone.brightness;
+            exposure.request(tone.brightness);
         }
         let mapping = |(name, text): (String, String)| match parsed(&text) {
             Some(mapping) => Ok((name, mapping)),

@@ -90,8 +90,9 @@ impl SceneTone {
             scene.mappings.insert(view.name.clone(), scene.mapping_of(measured));
         }
         scene.model_gain = scene.model_exposure().map(|_| {
-            let gains = scene.mappings.values().filter_map(|mapping| mapping.gain.map(f64::ln));
-            (gains.sum::<f64>() / scene.mappings.len().max(1) as f64).exp()
+            let gains: Vec<f64> =
+                scene.mappings.values().filter_map(|mapping| mapping.gain.map(f64::ln)).collect();
+            (gains.iter().sum::<f64>() / gains.len().max(1) as f64).exp()
         });
         Ok(scene)
     }

@@ -2,6 +2,7 @@
 //! kernels' parameters, dual numbers for the derivatives of a fit, f32 for the kernels' references.
 
 use super::families::{Constants, curve_shape};
+use super::metering::{shoulder, toe};
 use super::real::{Real, within};
 use crate::kernels::ToneParameters;
 use crate::kernels::curves::*;
@@ -48,7 +49,8 @@ pub(crate) fn curve_at<T: Real>(curve: u32, t: T, [offset, gain]: [T; 2], c: &Co
     let one = T::from_f64(1.0);
     match curve {
         CURVE_NONE | CURVE_LINEAR => t,
-        CURVE_ASE | CURVE_AUTO => offset + (one - offset) * (gain * t).one_minus_exp(),
+        CURVE_ASE => offset + (one - offset) * (gain * t).one_minus_exp(),
+        CURVE_AUTO => toe(offset + (one - offset) * shoulder(t, c[1]), offset, [c[2], c[3]]),
         CURVE_AP3 => offset + gain * curve_shape(curve, t, c),
         CURVE_TANH => offset + (one - offset) * (gain * within(t)).tanh(),
         CURVE_ASE_FLOOR => {

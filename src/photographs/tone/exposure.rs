@@ -1,41 +1,25 @@
-//! The brightness of targets: a gain chosen from the luminance of dark photographs.
+//! The brightness of targets: a gain for each photograph, chosen from all of a scene.
 //!
 //! ```text
-//! soft(x; k) = delta + (1 - delta) (1 - exp(-k x))                       delta = 0.075
-//! gain(H)    k = 0.90 / (mean W^3)^(1/3), W = min(Y, 99.9 % quantile of Y)
-//!            within the gains at which the mean of soft(Y; k) is 0.44 and 0.54, at most 128
-//! ln k_v     = s ln gain(view) + (1 - s) around(view)
+//! ln k_v     = s ln gain(view) + (1 - s) around(view)                    gain: see `metering`
 //! around(v)  = sum_w a_vw ln gain(w) / sum_w a_vw            a_vw = exp(-|p_v - p_w|^2 / (2 h^2)), h = 0.15
 //! s          = tau^2 / (tau^2 + 0.1^2)
 //! brightening = mean soft(Y; k) / mean Y, over the scene
 //! ```
 //!
-//! H is the histogram of the encoded luminance Y of one photograph, or of all training photographs together. p is a
-//! camera's position, in units of the standard deviation of all positions, together with its viewing direction; tau is
-//! the root mean square of ln gain(v) - around(v) over the views. So views of the same content have consistent targets,
-//! unless their exposures differ. If the cameras are unknown, ln gain(scene) replaces around(v), and s is max(0.75,
-//! sigma^2 / (sigma^2 + 0.1^2)), with sigma the standard deviation of ln gain over the views. A cubic mean is between
-//! average metering (power 1) and metering for the highlights (infinity): a scene of high contrast gets less exposure,
-//! as a photographer would choose. Lamps and windows make it unbounded, so the mean is limited (18 % grey is 0.46 when
-//! encoded). Power and constants were chosen on pairs of low- and normal-light photographs (LOL, LOM, `RealX3D`).
+//! p is a camera's position, in units of the standard deviation of all positions, together with its viewing direction;
+//! tau is the root mean square of ln gain(v) - around(v) over the views. So views of the same content have consistent
+//! targets, unless their exposures differ. If the cameras are unknown, ln gain(scene) replaces around(v), and s is
+//! max(0.75, sigma^2 / (sigma^2 + 0.1^2)), with sigma the standard deviation of ln gain over the views.
+//!
+//! A camera's night mode leaves some photographs dark and others lit. If a wide gap separates them, the lit ones are
+//! their own targets, and the dark ones get the same mean luminance.
 
 use serde::{Deserialize, Serialize};
 
 use super::histogram::LuminanceHistogram;
-use super::real::Real;
+use super::metering::{CurveEnds, Metering, gain_at, mean_of_soft};
 use crate::camera::{Camera, CameraPoses};
-
-/// The black level of [`soft`].
-pub(super) const BLACK_LEVEL: f64 = 0.075;
-
-/// The cubic mean of the luminance times the gain.
-const CUBIC_MEAN: f64 = 0.90;
-
-/// Minimum and maximum of a target's mean luminance.
-const MEANS: [f64; 2] = [0.44, 0.54];
-
-/// Minimum and maximum of the gain.
-const GAINS: [f64; 2] = [1e-3, 128.0];
 
 /// The minimum weight of a view's own gain if cameras are unknown.
 const MIN_SHARE: f64 = 0.75;
@@ -56,10 +40,14 @@ const WELL_LIT: [f64; 2] = [1.5, 2.0];
 /// A photograph whose 99 % quantile is lower is almost black: two 8-bit code values.
 const BLACK: f64 = 2.0 / 255.0;
 
-/// delta + (1 - delta) (1 - exp(-k x)): the curve to which the rule applies.
-pub fn soft(x: f64, gain: f64) -> f64 {
-    BLACK_LEVEL + (1.0 - BLACK_LEVEL) * (gain * x).one_minus_exp()
-}
+/// A gap of brightenings of at least this factor separates lit photographs from dark ones.
+const LIT_GAP: f64 = 2.5;
+
+/// The fewest photographs on either side of the gap.
+const MIN_GROUP: usize = 2;
+
+/// Minimum and maximum of the mean luminance that lit photographs set for the dark ones.
+const LIT_MEANS: [f64; 2] = [0.35, 0.6];
 
 /// The exposure of a set of photographs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -78,8 +66,13 @@ pub struct Exposure {
     pub share: f64,
     /// The number of almost black photographs.
     pub black: usize,
-    /// The requested mean luminance, in place of the rule's.
-    pub(crate) brightness: Option<f64>,
+    /// The number of photographs among dark ones that are well lit, and their own targets.
+    pub lit: usize,
+    /// How the curve reaches white and leaves black.
+    pub ends: CurveEnds,
+    metering: Metering,
+    /// The brightening below which a photograph is lit, if there are lit and dark ones.
+    lit_below: Option<f64>,
     /// The gains of views by their cameras, if known.
     around: Option<NeighbourGains>,
 }
@@ -113,30 +106,36 @@ impl Exposure {
         views: impl IntoIterator<Item = &'a LuminanceHistogram>,
         brightness: Option<f64>,
     ) -> Option<Self> {
-        let (mut pool, mut gains, mut black) = (LuminanceHistogram::default(), vec![], 0);
-        for view in views {
-            if is_black(view) {
-                black += 1;
-                continue;
-            }
-            pool.add(view);
-            gains.push(gain_of(view, brightness).ln());
-        }
-        if gains.is_empty() {
+        let (black, seen): (Vec<_>, Vec<_>) = views.into_iter().partition(|view| is_black(view));
+        let lit_below = if brightness.is_some() { None } else { lit_below(&seen) };
+        let is_lit = |view: &&LuminanceHistogram| is_lit(view, lit_below);
+        let (lit, dark): (Vec<_>, Vec<_>) = seen.into_iter().partition(is_lit);
+        if dark.is_empty() {
             return None;
         }
+        let pool = pooled(&dark);
+        let mut metering = Metering::new(&dark, brightness);
+        if !lit.is_empty() {
+            let lit_mean = pooled(&lit).mean().clamp(LIT_MEANS[0], LIT_MEANS[1]);
+            metering.ln_factor = (gain_at(&pool, lit_mean) / metering.gain_of(&pool)).ln();
+        }
+        let gains: Vec<f64> = dark.iter().map(|view| metering.gain_of(view).ln()).collect();
         let mean_gain = gains.iter().sum::<f64>() / gains.len() as f64;
         let squares = gains.iter().map(|gain| (gain - mean_gain).powi(2));
         let variance = squares.sum::<f64>() / gains.len() as f64;
-        let gain = gain_of(&pool, brightness);
+        let gain = metering.gain_of(&pool);
+        let ends = metering.ends(&pool, gain);
         Some(Self {
             gain,
-            target: mean_of_soft(&pool, gain),
+            target: pool.mean_of(|y| ends.soft(y, gain)),
             mean: pool.mean(),
             spread: variance.sqrt(),
             share: share_without_cameras(variance),
-            black,
-            brightness,
+            black: black.len(),
+            lit: lit.len(),
+            ends,
+            metering,
+            lit_below,
             around: None,
         })
     }
@@ -147,9 +146,9 @@ impl Exposure {
         self,
         views: impl IntoIterator<Item = (&'a LuminanceHistogram, Camera)>,
     ) -> Self {
-        let lit = views.into_iter().filter(|(view, _)| !is_black(view));
+        let dark = views.into_iter().filter(|(view, _)| !is_black(view) && !self.is_lit(view));
         let (gains, cameras): (Vec<f64>, Vec<Camera>) =
-            lit.map(|(view, camera)| (gain_of(view, self.brightness).ln(), camera)).unzip();
+            dark.map(|(view, camera)| (self.metering.gain_of(view).ln(), camera)).unzip();
         if gains.is_empty() {
             return self;
         }
@@ -174,6 +173,11 @@ impl Exposure {
         Self { share: share.clamp(0.0, 1.0), around: Some(around), ..self }
     }
 
+    /// Sets the requested brightness, which files of exposures lack.
+    pub(crate) fn request(&mut self, brightness: Option<f64>) {
+        self.metering.brightness = brightness;
+    }
+
     /// The exposure with one gain for every photograph.
     #[must_use]
     pub fn shared(self) -> Self {
@@ -185,13 +189,18 @@ impl Exposure {
         if is_black(view) {
             return self.gain;
         }
-        let ln_gain = gain_of(view, self.brightness).ln();
+        let ln_gain = self.metering.gain_of(view).ln();
         let (share, other) = match (&self.around, camera) {
             (Some(around), Some(camera)) => (around.own_share, around.ln_gain(camera)),
             (Some(_), None) => (share_without_cameras(self.spread.powi(2)), self.gain.ln()),
             (None, _) => (self.share, self.gain.ln()),
         };
         (share * ln_gain + (1.0 - share) * other).exp()
+    }
+
+    /// Whether a photograph is its own target, as others are dark.
+    pub(crate) fn is_lit(&self, view: &LuminanceHistogram) -> bool {
+        is_lit(view, self.lit_below)
     }
 
     /// k of what a camera sees, without a photograph of it: the mean of its neighbours, or the scene's.
@@ -208,7 +217,7 @@ impl Exposure {
     /// requested brightness.
     pub fn weight(&self) -> f64 {
         let [none, whole] = WELL_LIT;
-        if self.brightness.is_some() {
+        if self.metering.brightness.is_some() {
             1.0
         } else {
             ((self.brightening() - none) / (whole - none)).clamp(0.0, 1.0)
@@ -217,7 +226,7 @@ impl Exposure {
 
     /// The result and its reason, in a sentence.
     pub fn reason(&self) -> String {
-        let Self { gain, target, mean, spread, black, .. } = self;
+        let Self { gain, target, mean, spread, black, lit, .. } = self;
         let brightening = self.brightening();
         let verdict = match self.weight() {
             0.0 => "well lit, no curve".to_owned(),
@@ -232,19 +241,24 @@ impl Exposure {
             0 => String::new(),
             count => format!("; {count} almost black, left out of the measurement"),
         };
+        let lit = match lit {
+            0 => String::new(),
+            count => format!("; {count} well lit, their own targets"),
+        };
         format!(
-            "mean luminance {mean:.3}, {brightening:.1} times that is {target:.2}: {verdict}{varies}{left_out}"
+            "mean luminance {mean:.3}, {brightening:.1} times that is {target:.2}: {verdict}{varies}{left_out}{lit}"
         )
     }
 }
 
-/// The values from which values at one gain are interpolated to another, at this weight of the curve; ascending.
-pub fn exposure_knots([from, to]: [f64; 2], weight: f64) -> Vec<[f32; 2]> {
+/// The values from which values at one gain are interpolated to another, at this weight of a curve with these ends;
+/// ascending.
+pub fn exposure_knots(ends: &CurveEnds, [from, to]: [f64; 2], weight: f64) -> Vec<[f32; 2]> {
     const KNOTS: u32 = 1024;
     // Evenly spaced in the output of the curve, up to its white.
     let knot = |i: u32| {
         let x = -(1.0 - f64::from(i) / f64::from(KNOTS + 1)).ln() / from.min(to);
-        [from, to].map(|gain| ((1.0 - weight) * x.min(1.0) + weight * soft(x, gain)) as f32)
+        [from, to].map(|gain| ((1.0 - weight) * x.min(1.0) + weight * ends.soft(x, gain)) as f32)
     };
     (0..=KNOTS).map(knot).collect()
 }
@@ -260,13 +274,31 @@ struct SerializedExposure {
     spread: f64,
     share: f64,
     black: usize,
+    #[serde(default)]
+    lit: usize,
+    #[serde(default)]
+    ends: CurveEnds,
     reason: String,
 }
 
 impl From<SerializedExposure> for Exposure {
     fn from(written: SerializedExposure) -> Self {
-        let SerializedExposure { gain, target, mean, spread, share, black, .. } = written;
-        Self { gain, target, mean, spread, share, black, brightness: None, around: None }
+        let SerializedExposure { gain, target, mean, spread, share, black, lit, ends, .. } =
+            written;
+        let metering = Metering::default();
+        Self {
+            gain,
+            target,
+            mean,
+            spread,
+            share,
+            black,
+            lit,
+            ends,
+            metering,
+            lit_below: None,
+            around: None,
+        }
     }
 }
 
@@ -274,8 +306,8 @@ impl From<Exposure> for SerializedExposure {
     fn from(exposure: Exposure) -> Self {
         let (brightening, weight, reason) =
             (exposure.brightening(), exposure.weight(), exposure.reason());
-        let Exposure { gain, target, mean, spread, share, black, .. } = exposure;
-        Self { gain, target, mean, brightening, weight, spread, share, black, reason }
+        let Exposure { gain, target, mean, spread, share, black, lit, ends, .. } = exposure;
+        Self { gain, target, mean, brightening, weight, spread, share, black, lit, ends, reason }
     }
 }
 
@@ -296,34 +328,28 @@ pub fn is_black(view: &LuminanceHistogram) -> bool {
     view.quantile(0.99) < BLACK
 }
 
-/// gain(H), or the gain at which the mean luminance is `brightness`.
-fn gain_of(luminance: &LuminanceHistogram, brightness: Option<f64>) -> f64 {
-    if let Some(mean) = brightness {
-        return gain_at(luminance, mean);
-    }
-    let gain = (CUBIC_MEAN / luminance.cubic_mean()).clamp(GAINS[0], GAINS[1]);
-    match mean_of_soft(luminance, gain) {
-        mean if mean < MEANS[0] => gain_at(luminance, MEANS[0]),
-        mean if mean > MEANS[1] => gain_at(luminance, MEANS[1]),
-        _ => gain,
-    }
+/// The brightening of a photograph that is metered by itself.
+fn brightening(view: &LuminanceHistogram) -> f64 {
+    mean_of_soft(view, Metering::default().gain_of(view)) / view.mean()
 }
 
-fn mean_of_soft(luminance: &LuminanceHistogram, gain: f64) -> f64 {
-    luminance.mean_of(|y| soft(y, gain))
+fn is_lit(view: &LuminanceHistogram, lit_below: Option<f64>) -> bool {
+    lit_below.is_some_and(|below| brightening(view) < below)
 }
 
-/// The gain at which the mean of the curve is `mean`.
-fn gain_at(luminance: &LuminanceHistogram, mean: f64) -> f64 {
-    solved(GAINS, |gain| mean_of_soft(luminance, gain) < mean)
+/// The brightening in the middle of the widest gap, if it separates lit photographs from dark ones.
+fn lit_below(views: &[&LuminanceHistogram]) -> Option<f64> {
+    let mut brightenings: Vec<f64> = views.iter().map(|view| brightening(view)).collect();
+    brightenings.sort_by(f64::total_cmp);
+    let last = brightenings.len().checked_sub(MIN_GROUP)?;
+    let gap = |&at: &usize| brightenings[at] / brightenings[at - 1];
+    let at = (MIN_GROUP..=last).max_by(|a, b| gap(a).total_cmp(&gap(b)))?;
+    let [lit, dark] = [brightenings[at - 1], brightenings[at]];
+    (dark >= LIT_GAP * lit && lit < WELL_LIT[0] && dark >= WELL_LIT[1]).then(|| (lit * dark).sqrt())
 }
 
-/// The first strength within bounds that is not too low, by bisection of its logarithm; a bound if there is none.
-pub(super) fn solved(bounds: [f64; 2], is_low: impl Fn(f64) -> bool) -> f64 {
-    let [mut low, mut high] = bounds.map(f64::ln);
-    for _ in 0..50 {
-        let middle = 0.5 * (low + high);
-        *(if is_low(middle.exp()) { &mut low } else { &mut high }) = middle;
-    }
-    (0.5 * (low + high)).exp()
+fn pooled(views: &[&LuminanceHistogram]) -> LuminanceHistogram {
+    let mut pool = LuminanceHistogram::default();
+    views.iter().for_each(|view| pool.add(view));
+    pool
 }

@@ -14,21 +14,45 @@ const BINS: usize = 4096;
 /// The number of pixels per luminance, in bins of a 128th of an octave; everything below 2^-15 counts as 0.
 ///
 /// Derived values have an error of at most 0.4 % (if all pixels are equal), and far less for a photograph.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct LuminanceHistogram {
     /// The non-empty bins, ascending, with their numbers of pixels.
     counts: Vec<(u32, u64)>,
     black: u64,
+    /// Over all pixels, of the difference between the largest and smallest channel, and of the largest.
+    chroma: f64,
+    value: f64,
+    /// Whether any of the photographs has more than one channel that is not empty.
+    has_colour: bool,
+}
+
+/// A channel whose sum is less than this fraction of the largest is empty.
+const EMPTY_CHANNEL: f64 = 0.01;
+
+/// For each channel itself, or the brightest one if it is empty: an image intensifier fills green alone.
+fn filled_channels(planes: [&[f32]; 3]) -> [usize; 3] {
+    let sums = planes.map(|plane| plane.iter().map(|&x| f64::from(measurable(x))).sum::<f64>());
+    let brightest = (0..3).fold(0, |most, at| if sums[at] > sums[most] { at } else { most });
+    let is_empty = |at: usize| sums[at] < EMPTY_CHANNEL * sums[brightest];
+    [0, 1, 2].map(|at| if is_empty(at) { brightest } else { at })
 }
 
 impl LuminanceHistogram {
-    /// The histogram of a planar (3, H, W) photograph, sRGB-encoded; NaN and negative values count as 0.
+    /// The histogram of a planar (3, H, W) photograph, sRGB-encoded; NaN and negative values count as 0. An
+    /// empty channel counts as the brightest.
     pub fn new(planes: &[f32]) -> Self {
         let (red, rest) = planes.split_at(planes.len() / 3);
         let (green, blue) = rest.split_at(red.len());
+        let filled = filled_channels([red, green, blue]);
         let mut counts = vec![0_u32; BINS];
+        let (mut chroma, mut value) = (0.0, 0.0);
         for ((&r, &g), &b) in red.iter().zip(green).zip(blue) {
-            let number = luminance([r, g, b].map(measurable)).to_bits() >> BIN_SHIFT;
+            let rgb = filled.map(|channel| measurable([r, g, b][channel]));
+            let [red, green, blue] = rgb;
+            let most = red.max(green).max(blue);
+            chroma += f64::from(most - red.min(green).min(blue));
+            value += f64::from(most);
+            let number = luminance(rgb).to_bits() >> BIN_SHIFT;
             let bin = number.checked_sub(FIRST_BIN);
             if let Some(count) = bin.and_then(|bin| counts.get_mut(bin as usize)) {
                 *count += 1;
@@ -37,12 +61,43 @@ impl LuminanceHistogram {
         let bins = (0..).zip(counts).filter(|(_, count)| *count > 0);
         let counts: Vec<(u32, u64)> = bins.map(|(bin, count)| (bin, count.into())).collect();
         let lit: u64 = counts.iter().map(|(_, count)| count).sum();
-        Self { black: red.len() as u64 - lit, counts }
+        let has_colour = filled.iter().any(|channel| *channel != filled[0]);
+        Self { black: red.len() as u64 - lit, counts, chroma, value, has_colour }
+    }
+
+    /// Whether only one channel has light, as that of an image intensifier.
+    pub(super) fn is_one_channel(&self) -> bool {
+        !self.has_colour && self.value > 0.0
+    }
+
+    /// Mean difference between the largest and smallest channel over the mean of the largest: 0 for greys, 1 for pure
+    /// colours.
+    pub(super) fn saturation(&self) -> f64 {
+        self.chroma / self.value.max(f64::MIN_POSITIVE)
+    }
+
+    /// The fraction of the pixels whose luminance is lower.
+    pub(super) fn fraction_below(&self, luminance: f64) -> f64 {
+        self.mean_of(|level| f64::from(u8::from(level < luminance)))
+    }
+
+    /// With a fraction of the pixels below a luminance left out.
+    pub(super) fn without_below(&self, luminance: f64, left_out: f64) -> Self {
+        let kept = |count: u64| ((1.0 - left_out) * count as f64).round() as u64;
+        let mut rest = self.clone();
+        rest.black = kept(rest.black);
+        for (bin, count) in &mut rest.counts {
+            *count = if centre(*bin) < luminance { kept(*count) } else { *count };
+        }
+        rest
     }
 
     /// Adds the pixels of another photograph.
     pub fn add(&mut self, other: &Self) {
         self.black += other.black;
+        self.chroma += other.chroma;
+        self.value += other.value;
+        self.has_colour |= other.has_colour;
         self.counts.extend(&other.counts);
         // Two ascending runs, which a stable sort merges.
         self.counts.sort_by_key(|&(bin, _)| bin);
@@ -82,22 +137,27 @@ impl LuminanceHistogram {
         self.mean_of(|luminance| luminance)
     }
 
-    /// The cubic mean of the luminance, between the mean and the highlights; higher values are clamped to the 99.9 %
-    /// quantile, against hot pixels.
+    /// The cubic mean of the luminance, between the mean and the highlights. Higher values are clamped to the 99.9 %
+    /// quantile, against hot pixels, and to a multiple of the 90 % quantile, against lamps.
     pub fn cubic_mean(&self) -> f64 {
-        let hot = self.quantile(0.999);
-        self.mean_of(|luminance| luminance.min(hot).powi(3)).cbrt()
+        /// The brightest surfaces of evenly lit scenes have 1.4 to 2.4 times the 90 % quantile.
+        const LAMP: f64 = 2.5;
+        let (hot, bright) = (self.quantile(0.999), self.quantile(0.9));
+        let limit = if bright > 0.0 { hot.min(LAMP * bright) } else { hot };
+        self.mean_of(|luminance| luminance.min(limit).powi(3)).cbrt()
     }
 
     /// The luminances of non-empty bins (0, or the centres of bins), ascending, with their numbers of pixels.
     fn levels(&self) -> impl Iterator<Item = (f64, u64)> + '_ {
-        let middle = |bin: u32| {
-            let number = FIRST_BIN + bin;
-            f64::from(f32::from_bits((number << BIN_SHIFT) | 1 << (BIN_SHIFT - 1)))
-        };
-        let bins = self.counts.iter().map(move |&(bin, count)| (middle(bin), count));
+        let bins = self.counts.iter().map(|&(bin, count)| (centre(bin), count));
         std::iter::once((0.0, self.black)).chain(bins).filter(|&(_, count)| count > 0)
     }
+}
+
+/// The luminance in the middle of a bin.
+fn centre(bin: u32) -> f64 {
+    let number = FIRST_BIN + bin;
+    f64::from(f32::from_bits((number << BIN_SHIFT) | 1 << (BIN_SHIFT - 1)))
 }
 
 #[cfg(test)]

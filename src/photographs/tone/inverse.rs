@@ -7,7 +7,7 @@
 //! that limit, and are counted.
 
 use super::curve::{Curve, clamped};
-use super::real::Real;
+use super::metering::{shoulder, toe};
 use super::{SceneLaw, Table, Tone, ToneParameters, ToneSettings};
 use crate::kernels::curves::{CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_TABLE};
 use crate::photographs::image::{linear_from_srgb, srgb_from_linear};
@@ -82,9 +82,9 @@ impl InverseTone {
         let t = x / white;
         let curved = match *number {
             CURVE_AUTO => {
-                let share = constants[0];
-                let toe = (1.0 - share) * t.one_minus_exp() + share * t * factor;
-                offset + (1.0 - offset) * toe
+                let [share, bend, end, weight, ..] = *constants;
+                let soft = (1.0 - share) * shoulder(t, bend) + share * t * factor;
+                toe(offset + (1.0 - offset) * soft, *offset, [end, weight])
             }
             CURVE_TABLE => self.table.as_ref().map_or(t, |table| table.value(t, channel)),
             // A pixel's gain is that of its luminance, up to 1e-6 of it.
@@ -98,7 +98,7 @@ impl InverseTone {
     /// The factor s(Y) / Y of the automatic curve.
     fn factor(&self, rgb: [f64; 3]) -> f64 {
         let y = (luminance(rgb) / self.curve.white).max(1e-20);
-        y.one_minus_exp() / y
+        shoulder(y, self.curve.constants[1]) / y
     }
 
     /// The value of a photograph whose target is `value`.
@@ -225,6 +225,20 @@ mod tests {
                 }
             }
             assert!(restored > 3, "{curve}: {restored}");
+        }
+    }
+
+    #[test]
+    fn a_shoulder_and_a_toe_are_inverted() {
+        let constants = [1.0 / 3.0, 1.2, 0.25, 0.8, 0.0, 0.0, 0.0, 0.0];
+        let parameters =
+            ToneParameters { white: 0.05, offset: 0.075, gain: 1.0, weight: 1.0, constants };
+        let inverse = InverseTone::of_curve(CURVE_AUTO, None, &parameters);
+        for rgb in colours() {
+            let back = inverse.invert(inverse.target(rgb)).rgb;
+            for (value, back) in rgb.into_iter().zip(back) {
+                assert!((back / value - 1.0).abs() < 1e-3, "{rgb:?}: {value} becomes {back}");
+            }
         }
     }
 

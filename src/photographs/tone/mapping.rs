@@ -1,9 +1,10 @@
 //! From the measurements of a photograph to its curve, at a gain that follows from the exposure if it is automatic.
 
 use super::curve::{Curve, Variable, clamped, curve_at};
-use super::exposure::{Exposure, solved};
+use super::exposure::Exposure;
 use super::families::{Constants, White, padded};
 use super::histogram::LuminanceHistogram;
+use super::metering::{CurveEnds, soft, solved};
 use super::real::Real;
 use super::{Statistics, Tone, ToneParameters, ToneSettings};
 use crate::camera::Camera;
@@ -25,7 +26,8 @@ const STRENGTHS: [f64; 2] = [1e-3, 1e4];
 pub struct ToneMapping {
     /// The curve.
     pub parameters: ToneParameters,
-    /// k of soft(x; k), whose mean luminance the target has, if it follows from the exposure.
+    /// k of soft(x; k), whose mean luminance the target has, if it follows from the exposure and the photograph is not
+    /// its own target.
     pub gain: Option<f64>,
 }
 
@@ -185,17 +187,30 @@ impl ToneSettings {
             Tone::Auto | Tone::Profile(_) => gain,
             _ => self.strength(&parameters, luminance, gain),
         };
-        // A profile applies to bright photographs, too.
-        let is_profile = matches!(self.curve, Tone::Profile(_));
-        let weight = if is_profile { 1.0 } else { exposure.weight() };
+        let is_lit = exposure.is_lit(luminance);
+        let weight = match self.curve {
+            // A profile applies to bright photographs, too.
+            Tone::Profile(_) => 1.0,
+            _ if is_lit => 0.0,
+            _ => exposure.weight(),
+        };
+        let mut constants = parameters.constants;
+        if self.curve == Tone::Auto {
+            let CurveEnds { shoulder, toe, toe_weight } = exposure.ends;
+            // A blend with the photograph has its black.
+            let toe_weight = if weight < 1.0 { 0.0 } else { toe_weight };
+            // The luminance of one channel keeps no ratios.
+            constants[0] = if luminance.is_one_channel() { 0.0 } else { constants[0] };
+            constants[1..4].copy_from_slice(&[shoulder, toe, toe_weight].map(|end| end as f32));
+        }
         let (white, weight) = ((1.0 / strength) as f32, weight as f32);
-        let parameters = ToneParameters { white, gain: 1.0, weight, ..parameters };
-        ToneMapping { parameters, gain: Some(gain) }
+        let parameters = ToneParameters { white, gain: 1.0, weight, constants, ..parameters };
+        ToneMapping { parameters, gain: Some(gain).filter(|_| !is_lit) }
     }
 
     /// The factor on x that gives the curve the mean luminance of soft(x; gain).
     fn strength(&self, tone: &ToneParameters, luminance: &LuminanceHistogram, gain: f64) -> f64 {
-        let target = luminance.mean_of(|y| super::soft(y, gain));
+        let target = luminance.mean_of(|y| soft(y, gain));
         let (curve, scale) = (self.curve.constant(), [f64::from(tone.offset), 1.0]);
         let constants = tone.constants.map(f64::from);
         let mean = |strength: f64| {

@@ -7,7 +7,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use super::exposure::BLACK_LEVEL;
+use super::metering::BLACK_LEVEL;
 use super::{Constant, Family, Profile, Table, Tone, ToneCurve};
 use crate::base::settings::{self, Rule, Setting};
 use crate::{Error, Result};

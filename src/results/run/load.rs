@@ -12,6 +12,7 @@ use crate::base::input;
 use crate::gpu::Gpu;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::Dataset;
+use crate::photographs::tone::CurveEnds;
 use crate::splats::joined::TileManifest;
 use crate::splats::lamp::Lamp;
 use crate::splats::scene::{Features, Gaussians, ply};
@@ -46,6 +47,8 @@ pub(crate) struct RecordedExposure {
 pub(crate) struct RecordedScene {
     /// The weight of the curve.
     pub(crate) weight: Option<f64>,
+    #[serde(default)]
+    pub(crate) ends: CurveEnds,
 }
 
 /// The exposures of the targets of a run; `None` if they are unknown.
