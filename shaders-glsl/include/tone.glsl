@@ -30,7 +30,7 @@ float toe(float value, ToneParameters tone) {
     float weight = tone.constants[3];
     if (!(weight > 0.0 && value < end)) return value;
     float s = (value - tone.offset) / (end - tone.offset);
-    return value + weight * (0.5 * end * s * (1.0 + s) - value);
+    return value + weight * (end * s * (0.25 + 0.75 * s) - value);
 }
 
 float tone_curve(float x, ToneParameters tone) {

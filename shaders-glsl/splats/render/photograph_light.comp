@@ -71,8 +71,8 @@ float before_toe(float value) {
     float end = tone.constants[2];
     float weight = tone.constants[3];
     if (!(weight > 0.0 && value < end)) return value;
-    float a = 0.5 * weight * end;
-    float b = a + (1.0 - weight) * (end - tone.offset);
+    float a = 0.75 * weight * end;
+    float b = 0.25 * weight * end + (1.0 - weight) * (end - tone.offset);
     float c = (1.0 - weight) * tone.offset - value;
     return tone.offset - 2.0 * c / (b + sqrt(max(b * b - 4.0 * a * c, 0.0))) * (end - tone.offset);
 }

@@ -114,7 +114,7 @@ impl Exposure {
             return None;
         }
         let pool = pooled(&dark);
-        let mut metering = Metering::new(&dark, brightness);
+        let mut metering = Metering::new(&dark, &pool, brightness);
         if !lit.is_empty() {
             let lit_mean = pooled(&lit).mean().clamp(LIT_MEANS[0], LIT_MEANS[1]);
             metering.ln_factor = (gain_at(&pool, lit_mean) / metering.gain_of(&pool)).ln();

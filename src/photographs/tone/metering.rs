@@ -52,7 +52,7 @@ const BLACK: f64 = 0.2;
 
 /// Up to the first share of such pixels, all take part in the metering; from the second on, none of them. Evenly dark
 /// rooms have 0 to 0.35, a night sky 0.4 to 0.8.
-const BLACK_SHARES: [f64; 2] = [0.35, 0.55];
+const BLACK_SHARES: [f64; 2] = [0.35, 0.5];
 
 /// The toe ends at this multiple of the luminance below which pixels count as black.
 const TOE: f64 = 2.0;
@@ -96,15 +96,15 @@ pub(crate) fn shoulder<T: Real>(t: T, s: T) -> T {
     if s > T::from_f64(0.0) { ((s * t).ln_1p() / s).one_minus_exp() } else { t.one_minus_exp() }
 }
 
-/// The toe: from `black` to 0 and from `end` to itself, with half the slope of a line at black; values above `end`, and
-/// all of weight 0, are unchanged.
+/// The toe: from `black` to 0 and from `end` to itself, with a quarter of the slope of a line at black; values above
+/// `end`, and all of weight 0, are unchanged.
 pub(crate) fn toe<T: Real>(value: T, black: T, [end, weight]: [T; 2]) -> T {
     if !(weight > T::from_f64(0.0) && value < end) {
         return value;
     }
-    let (one, half) = (T::from_f64(1.0), T::from_f64(0.5));
+    let [quarter, three_quarters] = [0.25, 0.75].map(T::from_f64);
     let s = (value - black) / (end - black);
-    value + weight * (half * end * s * (one + s) - value)
+    value + weight * (end * s * (quarter + three_quarters * s) - value)
 }
 
 /// How the gains of a scene's photographs are chosen.
@@ -114,22 +114,40 @@ pub(super) struct Metering {
     pub(super) brightness: Option<f64>,
     /// A factor on each gain: from the rule's brightness to that of photographs that are well lit.
     pub(super) ln_factor: f64,
+    /// The luminance below which pixels of the whole scene count as black, and the luminance of its highlights.
+    black: f64,
+    highlights: f64,
     /// The share of black pixels that is left out.
     left_out: f64,
 }
 
+/// The quantile of highlights, which follow the exposure of a photograph, whatever share of it is black.
+const HIGHLIGHTS: f64 = 0.98;
+
 impl Metering {
-    /// The metering of the photographs of a scene.
-    pub(super) fn new(views: &[&LuminanceHistogram], brightness: Option<f64>) -> Self {
-        let whole = Self { brightness, ..Self::default() };
+    /// The metering of the photographs of a scene, from each and all together.
+    pub(super) fn new(
+        views: &[&LuminanceHistogram],
+        scene: &LuminanceHistogram,
+        brightness: Option<f64>,
+    ) -> Self {
+        let (black, highlights) = (BLACK / rule(scene, MEANS), scene.quantile(HIGHLIGHTS));
+        let whole = Self { brightness, black, highlights, ..Self::default() };
         // A requested brightness is that of all pixels.
         if brightness.is_some() {
             return whole;
         }
-        let shares = views.iter().map(|view| view.fraction_below(BLACK / rule(view, MEANS)));
+        let shares = views.iter().map(|view| view.fraction_below(whole.black_of(view)));
         let share = shares.sum::<f64>() / views.len().max(1) as f64;
         let [none, all] = BLACK_SHARES;
         Self { left_out: ((share - none) / (all - none)).clamp(0.0, 1.0), ..whole }
+    }
+
+    /// The luminance below which pixels of a photograph count as black: less than that of the scene if it is exposed
+    /// for a shorter time.
+    fn black_of(&self, view: &LuminanceHistogram) -> f64 {
+        let exposure = view.quantile(HIGHLIGHTS) / self.highlights.max(f64::MIN_POSITIVE);
+        self.black * exposure.min(1.0)
     }
 
     /// gain(H), or the gain at which the mean luminance is that requested.
@@ -137,13 +155,12 @@ impl Metering {
         if let Some(mean) = self.brightness {
             return gain_at(luminance, mean);
         }
-        let whole = rule(luminance, MEANS);
         let gain = if self.left_out > 0.0 {
-            let counted = luminance.without_below(BLACK / whole, self.left_out);
+            let counted = luminance.without_below(self.black_of(luminance), self.left_out);
             // The ground below a night sky is at most middle grey.
             rule(&counted, [MEANS[0], MEANS[1] - self.left_out * (MEANS[1] - MIDDLE_GREY)])
         } else {
-            whole
+            rule(luminance, MEANS)
         };
         let saturation = luminance.saturation().min(LARGEST_SATURATION) - TYPICAL_SATURATION;
         let ln_factor = self.ln_factor - PER_SATURATION * saturation;
@@ -157,8 +174,7 @@ impl Metering {
             return CurveEnds::default();
         }
         let toe_weight = self.left_out;
-        let toe_end = || soft(TOE * BLACK / rule(scene, MEANS), gain);
-        let toe = if toe_weight > 0.0 { toe_end() } else { 0.0 };
+        let toe = if toe_weight > 0.0 { soft(TOE * self.black, gain) } else { 0.0 };
         CurveEnds { shoulder: shoulder_below(scene, gain), toe, toe_weight }
     }
 }
@@ -226,7 +242,7 @@ mod tests {
         for lamps in [0, 1, 50, 1000] {
             let plane: Vec<f32> = (0..1000).map(|i| f32::from(u8::from(i < lamps))).collect();
             let found = LuminanceHistogram::new(&plane.repeat(3));
-            let metering = Metering::new(&[&found], None);
+            let metering = Metering::new(&[&found], &found, None);
             let gain = metering.gain_of(&found);
             let ends = metering.ends(&found, gain);
             assert!((GAINS[0]..=GAINS[1]).contains(&gain), "{lamps}: {gain}");
