@@ -149,7 +149,7 @@ void main() {
     vec3 light;
     if (TONE_CURVE == CURVE_AUTO) {
         // Written so that a NaN is black.
-        vec3 largest = vec3(1.0 - FLAT);
+        vec3 largest = vec3(min(target_of(LARGEST, 0), 1.0) - FLAT);
         value = mix(vec3(0.0), min(value, largest), greaterThan(value, vec3(0.0)));
         // The curve of no light is the black level.
         float black = tone.weight < 1.0 ? tone.weight * tone.offset : tone.offset;

@@ -67,11 +67,9 @@ impl InverseTone {
         let [white, offset, gain, weight] = [white, offset, gain, weight].map(f64::from);
         let curve = Curve { number, white, offset, gain, constants: constants.map(f64::from) };
         let mut inverse = Self { curve, table, weight, largest: [1.0; 3] };
-        // The automatic curve reaches white in every channel, through its own curve or that of the luminance.
-        let highest = |channel| match number {
-            CURVE_AUTO => 1.0,
-            _ => inverse.channel(LARGEST, channel, 0.0).min(1.0),
-        };
+        // The automatic curve reaches its limit in every channel, through its own curve or that of the luminance.
+        let factor = inverse.factor([LARGEST; 3]);
+        let highest = |channel| inverse.channel(LARGEST, channel, factor).min(1.0);
         inverse.largest = [0, 1, 2].map(|channel| highest(channel) - FLAT);
         inverse
     }

@@ -98,7 +98,7 @@ impl ToneSettings {
         /// Choose the gain from the photographs; c and g0 are then not used. Always on for the curve auto.
         auto_gain, "the curve's" => Rule::Flag;
         /// Mean luminance of the targets, with an automatic gain.
-        brightness, "chosen between 0.44 and 0.54" => Rule::from_to(0.1, 0.9), "--brightness T";
+        brightness, "chosen between 0.42 and 0.54" => Rule::from_to(0.1, 0.9), "--brightness T";
         /// Share of the curve auto that keeps the ratios of the channels.
         colour => Rule::SHARE, "--colour L";
         /// Tone-map photographs before they are resized.
