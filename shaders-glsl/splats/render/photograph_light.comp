@@ -23,6 +23,8 @@ layout(binding = 1)          buffer Render         { float render[]; };         
 
 const float FLAT = 0.5 / 255.0;
 const float LARGEST = 65504.0;
+// Of the automatic curve, whose shoulder may be long.
+const float BRIGHTEST = 64.0;
 // Relative precision of a solution, a few roundings, and the most trials: none takes this many.
 const float PRECISION = 5e-7;
 const uint TRIALS = 48;
@@ -149,7 +151,7 @@ void main() {
     vec3 light;
     if (TONE_CURVE == CURVE_AUTO) {
         // Written so that a NaN is black.
-        vec3 largest = vec3(min(target_of(LARGEST, 0), 1.0) - FLAT);
+        vec3 largest = vec3(min(target_of(BRIGHTEST, 0), 1.0) - FLAT);
         value = mix(vec3(0.0), min(value, largest), greaterThan(value, vec3(0.0)));
         // The curve of no light is the black level.
         float black = tone.weight < 1.0 ? tone.weight * tone.offset : tone.offset;

@@ -17,6 +17,8 @@ use crate::{Error, Result};
 const FLAT: f64 = 0.5 / 255.0;
 /// The largest encoded value of a photograph: that of an EXR in half floats.
 const LARGEST: f64 = 65_504.0;
+/// The light at which a long shoulder of the automatic curve is too flat for an inverse.
+const BRIGHTEST: f64 = 64.0;
 /// Relative precision of a solution.
 const PRECISION: f64 = 1e-7;
 const TRIALS: usize = 60;
@@ -67,9 +69,10 @@ impl InverseTone {
         let [white, offset, gain, weight] = [white, offset, gain, weight].map(f64::from);
         let curve = Curve { number, white, offset, gain, constants: constants.map(f64::from) };
         let mut inverse = Self { curve, table, weight, largest: [1.0; 3] };
-        // The automatic curve reaches its limit in every channel, through its own curve or that of the luminance.
-        let factor = inverse.factor([LARGEST; 3]);
-        let highest = |channel| inverse.channel(LARGEST, channel, factor).min(1.0);
+        // The automatic curve gets as high in every channel, through its own curve or that of the luminance.
+        let most = if number == CURVE_AUTO { BRIGHTEST } else { LARGEST };
+        let factor = inverse.factor([most; 3]);
+        let highest = |channel| inverse.channel(most, channel, factor).min(1.0);
         inverse.largest = [0, 1, 2].map(|channel| highest(channel) - FLAT);
         inverse
     }

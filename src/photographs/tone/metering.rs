@@ -63,8 +63,8 @@ pub const NEAR_WHITE: f64 = 0.94;
 /// The largest share of the targets' pixels that is near white, in addition to that of the photographs.
 const MOST_NEAR_WHITE: f64 = 0.02;
 
-/// The largest shoulder.
-const LONGEST_SHOULDER: f64 = 8.0;
+/// The largest shoulder: light of 100 / k is near white.
+const LONGEST_SHOULDER: f64 = 2.0;
 
 /// The ends of the automatic curve: how it reaches white and leaves black.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]

@@ -57,7 +57,7 @@ fn inverted(curve: u32, tone: ToneParameters, targets: &[[f32; 3]]) -> Vec<[f64;
 fn the_light_of_auto_is_the_hosts_inverse_to_a_ten_thousandth_up_to_clipping() {
     let targets = targets();
     let plain = [(1.0 / 3.0, 1.0), (0.0, 1.0), (1.0, 1.0), (0.6, 0.4), (0.3, 0.0)];
-    let bent = [[1.2, 0.0, 0.0], [0.0, 0.25, 1.0], [4.0, 0.4, 0.5]];
+    let bent = [[1.2, 0.0, 0.0], [0.0, 0.25, 1.0], [2.0, 0.4, 0.5]];
     let plain = plain.map(|(share, weight)| (share, weight, [0.0; 3]));
     let cases = plain.into_iter().chain(bent.map(|ends| (1.0 / 3.0, 1.0, ends)));
     for (share, weight, ends) in cases {
