@@ -133,10 +133,11 @@ impl ViewLights {
         self.lamps.iter().map(light).sum()
     }
 
-    /// The sky in a direction, if it is that of a night: all but black, with stars a quarter of a degree wide.
+    /// The sky in a direction, if it is that of a night: all but black, with stars. The size is a standard deviation,
+    /// radians.
     pub(super) fn sky(&self, direction: DVec3) -> Option<DVec3> {
         const BLACK: DVec3 = DVec3::new(0.000_7, 0.000_8, 0.001_1);
-        const SIZE: f64 = 0.25 * TAU / 360.0;
+        const SIZE: f64 = 0.2 * TAU / 360.0;
         let light = |star: &Star| {
             let off = (1.0 - direction.dot(star.direction)) / (SIZE * SIZE);
             if off < 8.0 { star.radiance * (-off).exp() } else { 0.0 }
@@ -169,7 +170,7 @@ impl ViewLights {
             if off < 1.0 && to_lamp.length() < distance {
                 (disc, distance) = (Some(lamp.radiance), to_lamp.length());
             } else if is_seen {
-                glow += GLOW * lamp.radiance / (1.0 + off * off).powf(1.3);
+                glow += GLOW * lamp.radiance / (1.0 + off * off).powf(1.1);
             }
         }
         let clear = if self.haze { (-EXTINCTION * distance).exp() } else { 1.0 };
@@ -213,7 +214,7 @@ impl ViewLights {
 
 /// The stars above the horizon, as drawn from the seed: few of them bright.
 fn stars(seed: u64) -> Vec<Star> {
-    const COUNT: u64 = 400;
+    const COUNT: u64 = 300;
     let stream = Stream::new(seed, STAR_STREAM << 32);
     let star = |index: u64| {
         let draw = |which| stream.uniform(3 * index + which);

@@ -295,7 +295,7 @@ impl Scene for Room {
     }
 
     fn street_lamps(&self) -> Vec<NightLamp> {
-        vec![NightLamp::street(DVec3::new(0.55, 1.5, 1.2), 0.08)]
+        vec![NightLamp::street(DVec3::new(0.4, 0.7, 1.45), 0.07)]
     }
 
     fn headlights(&self, _center: DVec3, along: f64) -> [NightLamp; 2] {

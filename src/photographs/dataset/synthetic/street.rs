@@ -48,7 +48,8 @@ pub(super) struct Street {
     ground: [SceneSurface<StreetMaterial>; 1],
     noise: TextureNoise,
     length: f64,
-    /// Whether the cameras see the sky: they are above the houses and look level across the street.
+    /// Whether the cameras see the sky: they are above the houses and look level across the street, whose light then
+    /// is the same everywhere.
     is_open: bool,
 }
 
@@ -186,8 +187,8 @@ impl Scene for Street {
         };
         let Some(carried) = &lights.carried else {
             let nearby = albedo * lights.irradiance(position, hit.normal, is_clear);
-            let falls = radiance * FALL.powf(0.5 - position.x / self.length);
-            return [radiance + nearby, falls + nearby];
+            let fall = if self.is_open { 0.0 } else { 0.5 - position.x / self.length };
+            return [radiance + nearby, radiance * FALL.powf(fall) + nearby];
         };
         let light = carried.light(position, hit.normal, is_clear);
         let light = light.map_or(DVec3::ZERO, |light| light.radiance * light.cosine);
@@ -207,7 +208,7 @@ impl Scene for Street {
         let x = self.length * (view as f64 + 0.5) / views as f64;
         if self.is_open {
             let across = a.signum();
-            let center = DVec3::new(x, across * (2.2 + 0.4 * a), 1.25 + 0.1 * b);
+            let center = DVec3::new(x, across * 3.1 + 0.3 * a, 1.25 + 0.1 * b);
             return [center, DVec3::new(-0.3 * c, across, -0.02).normalize()];
         }
         let center = DVec3::new(x, 1.15 * side + 0.15 * a, 1.95 + 0.2 * b);
@@ -219,13 +220,14 @@ impl Scene for Street {
     fn street_lamps(&self) -> Vec<NightLamp> {
         let lamp = |plot: usize| {
             let x = 3.0 * plot as f64 + 1.5 - BEYOND as f64;
-            NightLamp::street(DVec3::new(x, 0.62, 0.72), 0.03)
+            NightLamp::street(DVec3::new(x, 0.62, 0.72), 0.04)
         };
         (0..self.plots.len() / 3).map(lamp).collect()
     }
 
     fn headlights(&self, center: DVec3, along: f64) -> [NightLamp; 2] {
-        let middle = DVec3::new(center.x + 1.6 * along - 0.8, -0.3, 0.1);
+        let lane = -0.3 * center.y.signum();
+        let middle = DVec3::new(center.x + 1.6 * along - 0.8, lane, 0.1);
         NightLamp::pair(middle, DVec3::new(0.0, 0.06, 0.0), 0.022)
     }
 }
