@@ -3,9 +3,8 @@
 #
 #     scripts/night.sh [--train] [KIND...]
 #
-# A kind is a set of `nightsplat synth`; without a name, all of them, in about three minutes on two cores. A row has the
-# PSNR of the targets of `tone apply` against the references, their mean luminance and share of values from 250 of 255
-# on, with those of the references, the gain, and what `diagnose` remarks. --train adds the PSNR of a training.
+# A kind is `plain`, or options of `nightsplat synth` joined by +, such as street+sky; without one, those of
+# docs/night.md, which has the columns, in about three minutes on two cores. --train adds the PSNR of a training.
 #
 # NIGHTSPLAT    the command (default: target/release/nightsplat, built first)
 # SETS          the folder of the sets, in which they are kept and reused (default: a temporary folder)
@@ -16,36 +15,27 @@ if [ -z "${NIGHTSPLAT:-}" ]; then
     cargo build --quiet --release --bin nightsplat
     NIGHTSPLAT=${CARGO_TARGET_DIR:-target}/release/nightsplat
 fi
-scratch=$(mktemp -d)
-trap 'rm -rf "$scratch"' EXIT
+scratch=$(mktemp -d) && : > "$scratch/lines"
+trap '[ $? -eq 0 ] || cat "$scratch/lines" >&2; rm -rf "$scratch"' EXIT
 training=
 [ "${1:-}" != --train ] || { training=1 && shift; }
+[ $# -gt 0 ] || set -- plain sky street-lamp sky+street-lamp headlights haze haze+street-lamp street street+sky \
+    street+sky+street-lamp+headlights fall-off bands date night-mode raised-black one-channel brackets
 export NIGHTSPLAT_TUNE=off # the built-in tiles
 
-# The options of a kind are its name, or these.
-declare -A options=(
-    [plain]="" [sky+lamp]="--sky --street-lamp" [haze+lamp]="--haze --street-lamp" [street]="--street 3"
-    [street+sky]="--street 3 --sky" [street+night]="--street 3 --sky --street-lamp --headlights"
-)
-all=(plain sky street-lamp sky+lamp headlights haze haze+lamp street street+sky street+night
-    fall-off bands date night-mode raised-black one-channel brackets)
-
-# The row of a kind, of its set and the files of the scratch folder.
+# The row of a kind: row KIND REFERENCES SCRATCH.
 row() {
     python3 - "$@" << 'PYTHON'
-import json, pathlib, sys, zlib
-
+import json, math, pathlib, sys, zlib
 kind, references, scratch = sys.argv[1], *map(pathlib.Path, sys.argv[2:])
 mean = lambda numbers: sum(numbers) / len(numbers)
 read = lambda name: json.loads((scratch / name).read_text())
-
-def rows(png):
-    """The rows of bytes of an 8-bit RGB image."""
-    parts, at = {b"IDAT": b""}, 8
+def rows(png): # of bytes, of an 8-bit RGB image
+    chunks, at = {b"IDAT": b""}, 8
     while at < len(png):
         end, name = at + 8 + int.from_bytes(png[at:at + 4], "big"), png[at + 4:at + 8]
-        parts[name], at = parts.get(name, b"") + png[at + 8:end], end + 4
-    raw, stride = zlib.decompress(parts[b"IDAT"]), 3 * int.from_bytes(parts[b"IHDR"][:4], "big")
+        chunks[name], at = chunks.get(name, b"") + png[at + 8:end], end + 4
+    raw, stride = zlib.decompress(chunks[b"IDAT"]), 3 * int.from_bytes(chunks[b"IHDR"][:4], "big")
     above = bytes(stride)
     for start in range(0, len(raw), stride + 1):
         kind, row = raw[start], bytearray(raw[start + 1:start + 1 + stride])
@@ -55,33 +45,33 @@ def rows(png):
             row[i] = row[i] + (0, a, b, (a + b) // 2, paeth)[kind] & 255
         above = row
         yield row
-
-def light(folder):
-    """The mean luminance of a folder's images, and their share of values near white."""
-    values = b"".join(row for path in sorted(folder.glob("*.png")) for row in rows(path.read_bytes()))
-    weighted = zip((0.2126, 0.7152, 0.0722), (values[channel::3] for channel in range(3)))
-    return sum(weight * mean(plane) for weight, plane in weighted) / 255, 100 * mean([b >= 250 for b in values])
-
-(target, white), (right, right_white) = light(scratch / "targets"), light(references)
-applied, found = read("applied"), read("diagnosis")
-said = ["curve " + ("on" if found["plan"]["curve"]["on"] else "off"), *found["remarks"]]
-cells = [kind, f"{mean([view['psnr'] for view in applied['views'].values()]):.2f}", f"{target:.3f} ({right:.3f})",
-         f"{white:.1f} ({right_white:.1f})", f"{applied['exposure']['gain']:.1f}", "; ".join(said)]
-if (scratch / "scores").exists():
-    cells.insert(-1, f"{read('scores')['mean']['psnr']:.2f}")
-print("|", " | ".join(cells), "|", flush=True)
+def images(folder):
+    return [b"".join(rows(path.read_bytes())) for path in sorted(folder.glob("*.png"))]
+def light(images):
+    values = b"".join(images)
+    planes = zip((0.2126, 0.7152, 0.0722), (values[channel::3] for channel in range(3)))
+    return sum(weight * mean(plane) for weight, plane in planes) / 255, 100 * mean([b >= 250 for b in values])
+psnr = lambda a, b: 10 * math.log10(255 ** 2 / mean([(x - y) ** 2 for x, y in zip(a, b)]))
+targets, right, found = images(scratch / "targets"), images(references), read("diagnosis")
+scores = [psnr(a, b) for a, b in zip(targets, right, strict=True)]
+(luminance, white), (luminance_right, white_right) = light(targets), light(right)
+lines = [line.strip().removeprefix("WARN ") for line in (scratch / "lines").read_text().splitlines()]
+said = ["curve " + ("on" if found["plan"]["curve"]["on"] else "off"), *dict.fromkeys(lines), *found["remarks"]]
+cells = [kind, f"{mean(scores):.2f}", f"{luminance:.3f} ({luminance_right:.3f})",
+         f"{white:.1f} ({white_right:.1f})", f"{read('applied')['exposure']['gain']:.1f}", "; ".join(said)]
+trained = [f"{read('scores')['mean']['psnr']:.2f}"] if (scratch / "scores").exists() else []
+print("|", " | ".join([*cells[:-1], *trained, cells[-1]]), "|", flush=True)
 PYTHON
 }
 
 echo "| kind | PSNR, dB | mean (reference) | white, % (reference) | gain |${training:+ trained, dB |} remarks |"
 echo "|---|---:|---:|---:|---:|${training:+---:|}---|"
-[ $# -gt 0 ] || set -- "${all[@]}"
 for kind; do
     set=${SETS:-$scratch/sets}/$kind
-    read -r -a with <<< "${options[$kind]---$kind}"
-    [ -d "$set" ] || "$NIGHTSPLAT" synth "$set" "${with[@]}" > /dev/null
-    "$NIGHTSPLAT" tone apply "$set" --reference "$set/high" --out "$scratch/targets" --json > "$scratch/applied"
-    "$NIGHTSPLAT" diagnose "$set" --json > "$scratch/diagnosis"
+    read -r -a options <<< "$(sed -E 's/^|\+/ --/g; s/--plain//; s/--street( |$)/--street 3\1/' <<< "$kind")"
+    [ -d "$set" ] || "$NIGHTSPLAT" synth "$set" "${options[@]}" > /dev/null
+    "$NIGHTSPLAT" tone apply "$set" --out "$scratch/targets" --json > "$scratch/applied" 2> "$scratch/lines"
+    "$NIGHTSPLAT" diagnose "$set" --json > "$scratch/diagnosis" 2>> "$scratch/lines"
     if [ -n "$training" ]; then
         "$NIGHTSPLAT" train "$set" --out "$scratch/run" --overwrite --steps "${STEPS:-150}" --progress none > /dev/null
         "$NIGHTSPLAT" eval "$scratch/run" --json > "$scratch/scores"

@@ -20,7 +20,7 @@ use serde_json::{Value, json};
 
 pub use self::capture::{CameraFaults, Capture};
 pub use self::night::Night;
-use self::night::{NightLamp, ViewLights};
+use self::night::ViewLights;
 use self::room::Room;
 use self::street::Street;
 use crate::camera::{Camera, CameraModel, KannalaBrandt};
@@ -47,11 +47,12 @@ trait Scene: Sync {
     /// The position of camera `view` of `views`, and the unit vector from what it looks at towards it.
     fn camera_position(&self, view: usize, views: usize) -> [DVec3; 2];
 
-    /// The lamps at fixed positions.
-    fn street_lamps(&self) -> Vec<NightLamp>;
+    /// The radius of a street lamp, and the positions of all.
+    fn lamp_size(&self) -> f64;
+    fn street_lamps(&self) -> Vec<DVec3>;
 
-    /// The headlights that a camera at a position sees, by a draw in [0, 1).
-    fn headlights(&self, center: DVec3, along: f64) -> [NightLamp; 2];
+    /// The positions of the headlights that a camera at a position sees, by a draw in [0, 1).
+    fn headlights(&self, center: DVec3, along: f64) -> [DVec3; 2];
 }
 
 /// How much darker the dark photographs are, in linear light.
@@ -203,8 +204,8 @@ pub fn write_captured(
     for (view, camera) in cameras.iter().enumerate() {
         let name = file_name(view, cameras.len());
         let lights = ViewLights::new(options, &*scene, camera, view);
-        let [even, dim] = render(&*scene, camera, &lights)
-            .map(|light| capture.faults.channels(lights.scattered(light, camera)));
+        let [even, dim] =
+            render(&*scene, camera, &lights).map(|light| capture.faults.channels(light));
         bright_photograph(&even, camera).save_png8(high.join(&name))?;
         if let Some(lit) = lit.as_ref().filter(|_| is_test(view)) {
             bright_photograph(&dim, camera).save_png8(lit.join(&name))?;

@@ -81,12 +81,9 @@ impl Capture {
     }
 
     pub(super) fn check(&self) -> Result<()> {
-        match self.stops.iter().find(|stops| !(-10.0..=10.0).contains(*stops)) {
-            Some(stops) => {
-                Err(Error::Usage(format!("{stops} stops cannot be exposed; ask for -10 to 10")))
-            }
-            None => Ok(()),
-        }
+        let is_exposed = |stops: &f64| (-10.0..=10.0).contains(stops);
+        let refused = || Error::Usage("exposures are -10 to 10 stops; ask for these".to_owned());
+        self.stops.iter().all(is_exposed).then_some(()).ok_or_else(refused)
     }
 
     /// How much darker a view's photograph is than its reference. Night mode alternates, with a step at every test

@@ -3,7 +3,6 @@
 use std::f64::consts::TAU;
 
 use glam::{DVec2, DVec3};
-use rayon::prelude::*;
 
 use super::lamp::CameraLamp;
 use super::{Scene, SyntheticOptions, is_test};
@@ -23,7 +22,7 @@ pub struct Night {
     /// Two lamps close to each other, such as headlights, elsewhere in each photograph and in no test view
     #[cfg_attr(feature = "cli", arg(long))]
     pub headlights: bool,
-    /// Light scattered in the air: a veil that grows with depth, and a glow
+    /// Light scattered in the air: a veil that grows with depth, and a wider glow of lamps
     #[cfg_attr(feature = "cli", arg(long))]
     pub haze: bool,
 }
@@ -31,14 +30,6 @@ pub struct Night {
 impl Night {
     /// Nothing of it.
     pub const NONE: Self = Self { sky: false, street_lamp: false, headlights: false, haze: false };
-}
-
-/// A small sphere that shines.
-#[derive(Clone, Copy)]
-pub(super) struct NightLamp {
-    pub(super) position: DVec3,
-    pub(super) radius: f64,
-    pub(super) radiance: DVec3,
 }
 
 /// The streams of random numbers of the seed: of the stars, and of what moves.
@@ -49,36 +40,23 @@ const MOVING_STREAM: u64 = 5;
 const STREET_LAMP: DVec3 = DVec3::new(50.0, 42.5, 30.0);
 const HEADLIGHT: DVec3 = DVec3::new(50.0, 50.0, 47.0);
 
-impl NightLamp {
-    /// A street lamp of this radius.
-    pub(super) fn street(position: DVec3, radius: f64) -> Self {
-        Self { position, radius, radiance: STREET_LAMP }
-    }
-
-    /// A pair of headlights around a position.
-    pub(super) fn pair(middle: DVec3, half: DVec3, radius: f64) -> [Self; 2] {
-        [middle - half, middle + half].map(|position| Self {
-            position,
-            radius,
-            radiance: HEADLIGHT,
-        })
-    }
-}
-
-/// A star: its direction and radiance.
-struct Star {
-    direction: DVec3,
-    radiance: f64,
+/// A small sphere that shines.
+struct NightLamp {
+    position: DVec3,
+    radius: f64,
+    radiance: DVec3,
+    /// Whether the camera sees its middle.
+    is_seen: bool,
 }
 
 /// The lights of a view beside the scene's.
 pub(super) struct ViewLights {
     /// The lamp of the camera, if it carries one.
     pub(super) carried: Option<CameraLamp>,
-    /// The lamps nearby, and whether the camera sees their middle.
-    lamps: Vec<(NightLamp, bool)>,
-    /// Of the sky of a night; none without one.
-    stars: Vec<Star>,
+    /// The lamps nearby.
+    lamps: Vec<NightLamp>,
+    /// The directions and radiances of the stars; none without a sky.
+    stars: Vec<(DVec3, f64)>,
     haze: bool,
 }
 
@@ -94,20 +72,21 @@ impl ViewLights {
         const REACH: f64 = 8.0;
         let &SyntheticOptions { night, seed, lamp, .. } = options;
         let center = camera.center();
-        let fixed = if night.street_lamp { scene.street_lamps() } else { vec![] };
         let along = Stream::new(seed, MOVING_STREAM << 32).uniform(view as u64);
-        let moving = (night.headlights && !is_test(view)).then(|| scene.headlights(center, along));
-        let seen = |lamp: NightLamp| {
-            let direction = (lamp.position - center).normalize();
-            let distance = center.distance(lamp.position);
-            let first = scene.first_point(center, direction);
-            (lamp, first.is_none_or(|point| point.distance(center) > distance))
+        let size = scene.lamp_size();
+        let fixed = scene.street_lamps().into_iter().map(|at| (at, size, STREET_LAMP));
+        let moving = scene.headlights(center, along).map(|at| (at, 0.6 * size, HEADLIGHT));
+        let all = fixed.filter(|_| night.street_lamp);
+        let all = all.chain(moving.into_iter().filter(|_| night.headlights && !is_test(view)));
+        let lamp_at = |(position, radius, radiance): (DVec3, f64, DVec3)| {
+            let distance = center.distance(position);
+            let first = scene.first_point(center, (position - center) / distance);
+            let is_seen = first.is_none_or(|point| point.distance(center) > distance);
+            NightLamp { position, radius, radiance, is_seen }
         };
-        let lamps = fixed.into_iter().chain(moving.into_iter().flatten());
-        let lamps = lamps.filter(|lamp| lamp.position.distance(center) < REACH).map(seen);
         Self {
             carried: lamp.map(|degrees| CameraLamp::new(camera, degrees)),
-            lamps: lamps.collect(),
+            lamps: all.filter(|(at, ..)| at.distance(center) < REACH).map(lamp_at).collect(),
             stars: if night.sky { stars(seed) } else { vec![] },
             haze: night.haze,
         }
@@ -122,7 +101,7 @@ impl ViewLights {
         is_clear: impl Fn(DVec3, DVec3, f64) -> bool,
     ) -> DVec3 {
         let start = position + 1e-6 * normal;
-        let light = |(lamp, _): &(NightLamp, bool)| {
+        let light = |lamp: &NightLamp| {
             let distance = start.distance(lamp.position);
             let to_lamp = (lamp.position - start) / distance;
             let cosine = normal.dot(to_lamp);
@@ -138,14 +117,14 @@ impl ViewLights {
     pub(super) fn sky(&self, direction: DVec3) -> Option<DVec3> {
         const BLACK: DVec3 = DVec3::new(0.000_7, 0.000_8, 0.001_1);
         const SIZE: f64 = 0.2 * TAU / 360.0;
-        let light = |star: &Star| {
-            let off = (1.0 - direction.dot(star.direction)) / (SIZE * SIZE);
-            if off < 8.0 { star.radiance * (-off).exp() } else { 0.0 }
+        let light = |&(star, radiance): &(DVec3, f64)| {
+            let off = (1.0 - direction.dot(star)) / (SIZE * SIZE);
+            if off < 8.0 { radiance * (-off).exp() } else { 0.0 }
         };
         (!self.stars.is_empty()).then(|| BLACK + self.stars.iter().map(light).sum::<f64>())
     }
 
-    /// What a ray sees that would see `radiance` at its end: nearer lamps, their glow in the lens, and the air.
+    /// What a ray sees that would see `radiance` at its end: nearer lamps, their glow, and the air.
     pub(super) fn seen(
         &self,
         scene: &dyn Scene,
@@ -163,64 +142,32 @@ impl ViewLights {
         }
         let end = scene.first_point(origin, direction);
         let mut distance = end.map_or(f64::INFINITY, |end| end.distance(origin));
+        // The air scatters light farther than the lens.
+        let fall = if self.haze { 0.8 } else { 1.1 };
         let (mut disc, mut glow) = (None, DVec3::ZERO);
-        for &(lamp, is_seen) in &self.lamps {
+        for lamp in &self.lamps {
             let to_lamp = lamp.position - origin;
             let off = to_lamp.angle_between(direction) / (lamp.radius / to_lamp.length());
             if off < 1.0 && to_lamp.length() < distance {
                 (disc, distance) = (Some(lamp.radiance), to_lamp.length());
-            } else if is_seen {
-                glow += GLOW * lamp.radiance / (1.0 + off * off).powf(1.1);
+            } else if lamp.is_seen {
+                glow += GLOW * lamp.radiance / (1.0 + off * off).powf(fall);
             }
         }
         let clear = if self.haze { (-EXTINCTION * distance).exp() } else { 1.0 };
         radiance.map(|light| disc.unwrap_or(light).lerp(AIR, 1.0 - clear) + glow)
     }
-
-    /// Spreads a part of an image's light over its surroundings, as haze does.
-    pub(super) fn scattered(&self, light: Vec<DVec3>, camera: &Camera) -> Vec<DVec3> {
-        /// The part, and the standard deviation of its spread as a share of the image's width.
-        const PART: f64 = 0.25;
-        const SPREAD: f64 = 0.05;
-        if !self.haze {
-            return light;
-        }
-        let size = [camera.width as usize, camera.height as usize];
-        let deviation = SPREAD * f64::from(camera.width);
-        let along = |light: &[DVec3], axis: usize| -> Vec<DVec3> {
-            let reach = (3.0 * deviation) as usize;
-            let mean = |index: usize| {
-                let position = [index % size[0], index / size[0]];
-                let range = position[axis].saturating_sub(reach)
-                    ..(position[axis] + reach + 1).min(size[axis]);
-                let sum = range.fold((DVec3::ZERO, 0.0), |(sum, all), other| {
-                    let offset = (other as f64 - position[axis] as f64) / deviation;
-                    let weight = (-0.5 * offset * offset).exp();
-                    let index = if axis == 0 {
-                        position[1] * size[0] + other
-                    } else {
-                        other * size[0] + position[0]
-                    };
-                    (sum + weight * light[index], all + weight)
-                });
-                sum.0 / sum.1
-            };
-            (0..light.len()).into_par_iter().map(mean).collect()
-        };
-        let spread = along(&along(&light, 0), 1);
-        light.into_iter().zip(spread).map(|(light, spread)| light.lerp(spread, PART)).collect()
-    }
 }
 
 /// The stars above the horizon, as drawn from the seed: few of them bright.
-fn stars(seed: u64) -> Vec<Star> {
+fn stars(seed: u64) -> Vec<(DVec3, f64)> {
     const COUNT: u64 = 300;
     let stream = Stream::new(seed, STAR_STREAM << 32);
     let star = |index: u64| {
         let draw = |which| stream.uniform(3 * index + which);
         let (height, azimuth) = (draw(0), TAU * draw(1));
         let around = (1.0 - height * height).sqrt() * DVec2::from_angle(azimuth);
-        Star { direction: around.extend(height), radiance: (0.06 / draw(2)).min(6.0) }
+        (around.extend(height), (0.06 / draw(2)).min(6.0))
     };
     (0..COUNT).map(star).collect()
 }

@@ -8,7 +8,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use super::Scene;
 use super::lamp;
-use super::night::{NightLamp, ViewLights};
+use super::night::ViewLights;
 use super::shapes::{
     Hit, SceneSurface, SurfaceShape, TextureNoise, nearest, open_beside, smoothstep,
 };
@@ -49,8 +49,7 @@ const SKY_RADIANCE: DVec3 = DVec3::new(0.12, 0.135, 0.165);
 const GROUND_RADIANCE: DVec3 = DVec3::new(0.07, 0.055, 0.04);
 
 impl Room {
-    /// The room, or a yard, whose textures are drawn from `seed`; its cameras are at about one distance, or walk through
-    /// it.
+    /// The room, or a yard, whose textures are drawn from `seed`; its cameras are at about one distance, or walk.
     pub(super) fn new(seed: u64, is_walked: bool, is_open: bool) -> Self {
         let plane = |normal, offset, albedo| SceneSurface {
             shape: SurfaceShape::Plane { normal, offset },
@@ -294,13 +293,16 @@ impl Scene for Room {
         [center, (center - FOCUS - BESIDE * beside).normalize()]
     }
 
-    fn street_lamps(&self) -> Vec<NightLamp> {
-        vec![NightLamp::street(DVec3::new(0.4, 0.7, 1.45), 0.07)]
+    fn lamp_size(&self) -> f64 {
+        0.07
     }
 
-    fn headlights(&self, _center: DVec3, along: f64) -> [NightLamp; 2] {
-        let middle = DVec3::new(2.4 * along - 1.2, -0.1, 0.9);
-        NightLamp::pair(middle, DVec3::new(0.12, 0.0, 0.0), 0.05)
+    fn street_lamps(&self) -> Vec<DVec3> {
+        vec![DVec3::new(0.4, 0.7, 1.45)]
+    }
+
+    fn headlights(&self, _center: DVec3, along: f64) -> [DVec3; 2] {
+        [-1.32, -1.08].map(|x| DVec3::new(2.4 * along + x, -0.1, 0.9))
     }
 }
 

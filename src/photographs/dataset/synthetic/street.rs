@@ -7,7 +7,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use super::Scene;
 use super::lamp;
-use super::night::{NightLamp, ViewLights};
+use super::night::ViewLights;
 use super::shapes::{
     Hit, SceneSurface, SurfaceShape, TextureNoise, nearest, open_beside, smoothstep,
 };
@@ -216,19 +216,19 @@ impl Scene for Street {
         [center, (center - target).normalize()]
     }
 
-    /// Beside the road, every third plot.
-    fn street_lamps(&self) -> Vec<NightLamp> {
-        let lamp = |plot: usize| {
-            let x = 3.0 * plot as f64 + 1.5 - BEYOND as f64;
-            NightLamp::street(DVec3::new(x, 0.62, 0.72), 0.04)
-        };
-        (0..self.plots.len() / 3).map(lamp).collect()
+    fn lamp_size(&self) -> f64 {
+        0.04
     }
 
-    fn headlights(&self, center: DVec3, along: f64) -> [NightLamp; 2] {
-        let lane = -0.3 * center.y.signum();
-        let middle = DVec3::new(center.x + 1.6 * along - 0.8, lane, 0.1);
-        NightLamp::pair(middle, DVec3::new(0.0, 0.06, 0.0), 0.022)
+    /// Beside the road, every third plot.
+    fn street_lamps(&self) -> Vec<DVec3> {
+        let x = (0..self.plots.len()).step_by(3).map(|plot| plot as f64 + 1.5 - BEYOND as f64);
+        x.map(|x| DVec3::new(x, 0.62, 0.72)).collect()
+    }
+
+    fn headlights(&self, center: DVec3, along: f64) -> [DVec3; 2] {
+        let x = center.x + 1.6 * along - 0.8;
+        [0.24, 0.36].map(|y| DVec3::new(x, -y * center.y.signum(), 0.1))
     }
 }
 
