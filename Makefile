@@ -10,7 +10,7 @@ demo: vulkan
 test: vulkan
 	scripts/test.sh
 
-# What takes hours: hostile inputs, long runs, kills, fuzzing. docs/measurements.md has what it found.
+# What takes hours: hostile inputs, night captures, long runs, kills, fuzzing. docs/measurements.md has what it found.
 stress: vulkan
 	scripts/stress.py
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Campaigns that take too long for tests. Each prints its result; the first that fails ends the script.
 
-    scripts/stress.py [table] [conditioning] [cameras] [long] [kills] [fuzz] [guards] [growth]
+    scripts/stress.py [table] [night] [conditioning] [cameras] [long] [kills] [fuzz] [guards] [growth]
 
 Without a name, all of them run.
 
@@ -51,6 +51,11 @@ def synth(folder, side, views):
 def table(_):
     """Hostile inputs, each against the references."""
     run("cargo", "test", "--release", "--test", "cli", "--", "--ignored", "--nocapture", "whole_table")
+
+
+def night(_):
+    """Night captures, with trainings: the table of docs/measurements.md."""
+    run(ROOT / "scripts" / "night.sh", "--train", env={**os.environ, "NIGHTSPLAT": command()})
 
 
 def conditioning(_):
@@ -145,7 +150,7 @@ def growth(_):
     run("cargo", "test", "--release", "--lib", "--", "--ignored", "--nocapture", "no_round_of_a_real_scene")
 
 
-ALL = (table, conditioning, cameras, long, kills, fuzz, guards, growth)
+ALL = (table, night, conditioning, cameras, long, kills, fuzz, guards, growth)
 CAMPAIGNS = {campaign.__name__: campaign for campaign in ALL}
 
 

@@ -245,7 +245,7 @@ pub mod config {
 #[cfg(feature = "io")]
 pub mod synthetic {
     pub use crate::photographs::dataset::synthetic::{
-        Capture, SyntheticOptions, write, write_captured,
+        CameraFaults, Capture, Night, SyntheticOptions, write, write_captured,
     };
 }
 

@@ -4,7 +4,9 @@ use std::path::PathBuf;
 
 use super::{finish, word};
 use crate::Error;
-use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
+use crate::photographs::dataset::synthetic::{
+    self, CameraFaults, Capture, Night, SyntheticOptions,
+};
 
 /// Write a small dark multi-view dataset of an analytic scene, with references, in the layout of LOM.
 #[derive(Clone, Debug, clap::Args)]
@@ -34,6 +36,15 @@ pub struct SynthArgs {
     /// without noise [of --lamp alone: 16]
     #[arg(long, value_name = "DEGREES", num_args = 0..=1, require_equals = true, default_missing_value = "16")]
     pub lamp: Option<f64>,
+    /// What the scene has at night
+    #[command(flatten)]
+    pub night: Night,
+    /// What the camera does wrong
+    #[command(flatten)]
+    pub faults: CameraFaults,
+    /// Expose a third of the photographs this many stops shorter, and a third as much longer [of --brackets alone: 2]
+    #[arg(long, value_name = "STOPS", num_args = 0..=1, require_equals = true, default_missing_value = "2")]
+    pub brackets: Option<f64>,
     /// Write into a folder that is not empty, replacing files of the same names
     #[arg(long)]
     pub overwrite: bool,
@@ -41,7 +52,8 @@ pub struct SynthArgs {
 
 /// Writes the dataset.
 pub fn run(args: SynthArgs) -> anyhow::Result<()> {
-    let SynthArgs { dir, street, views, width, height, seed, fisheye, lamp, overwrite } = args;
+    let SynthArgs { dir, street, views, width, height, seed, fisheye, lamp, night, faults, .. } =
+        args;
     let usual = street.map_or_else(SyntheticOptions::default, SyntheticOptions::street);
     let options = SyntheticOptions {
         views: views.unwrap_or(usual.views),
@@ -50,14 +62,17 @@ pub fn run(args: SynthArgs) -> anyhow::Result<()> {
         seed,
         fisheye,
         lamp,
+        night,
         ..usual
     };
+    let stops = args.brackets.map_or(vec![0.0], |stops| vec![-stops, 0.0, stops]);
+    let capture = Capture { faults, stops, ..Capture::default() };
     let is_empty = std::fs::read_dir(&dir).map_or(true, |mut entries| entries.next().is_none());
-    if !is_empty && !overwrite {
+    if !is_empty && !args.overwrite {
         let problem = "is not empty; choose another folder or pass --overwrite";
         return Err(Error::output(dir, problem).into());
     }
-    synthetic::write(&dir, &options)?;
+    synthetic::write_captured(&dir, &options, &capture)?;
     let SyntheticOptions { views, width, height, .. } = options;
     let wrote = format!("{}: {views} views of {width}x{height}", dir.display());
     finish(&wrote, &format!("nightsplat train {} --out run", word(&dir)))

@@ -14,6 +14,7 @@ mod formats;
 mod hostile_bytes;
 mod lamp;
 mod metrics;
+mod night;
 mod properties;
 mod pseudo_gt;
 mod street;

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use glam::{DVec2, DVec3};
 use nightsplat::camera::CameraModel;
-use nightsplat::photographs::dataset::synthetic::{self, DARKENING, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic::{self, DARKENING, Night, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
 use nightsplat::photographs::image::{Image, linear_from_srgb};
 
@@ -20,6 +20,7 @@ const SMALL: SyntheticOptions = SyntheticOptions {
     fisheye: false,
     street: None,
     lamp: None,
+    night: Night::NONE,
 };
 
 /// Every file below a folder, by relative path.

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::Gpu;
-use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic::{self, Capture, Night, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, DepthOptions, LoadOptions};
 use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use nightsplat::train::diagnose::{Diagnosis, Plan};
@@ -22,6 +22,7 @@ const SET: SyntheticOptions = SyntheticOptions {
     fisheye: false,
     street: None,
     lamp: None,
+    night: Night::NONE,
 };
 const MEMORY: u64 = 8 << 30;
 

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use glam::DVec3;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic::{self, Capture, Night, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, View};
 use nightsplat::photographs::image::{Image, Mask};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
@@ -27,6 +27,7 @@ const SET: SyntheticOptions = SyntheticOptions {
     fisheye: false,
     street: None,
     lamp: None,
+    night: Night::NONE,
 };
 
 /// A room lit by one lamp: everything outside its light, including objects in front of walls, is black and has no

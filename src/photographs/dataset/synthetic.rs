@@ -5,6 +5,9 @@
 //! small sensor, encoded and quantised to 8 bits: as a camera stores it if the exposure is far too short. In a street
 //! this light also falls eightfold from one end to the other; that of the references does not. With a lamp that is
 //! fixed to the camera, the photographs have its light instead.
+//!
+//! [`Night`] adds what a scene has at night, and [`CameraFaults`] what a camera does wrong there. All light is linear
+//! until it has passed lens, shutter and noise.
 
 use std::f64::consts::PI;
 use std::fs;
@@ -15,16 +18,19 @@ use glam::{DAffine3, DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use self::lamp::CameraLamp;
+pub use self::capture::{CameraFaults, Capture};
+pub use self::night::Night;
+use self::night::ViewLights;
 use self::room::Room;
 use self::street::Street;
-use crate::base::random::Stream;
 use crate::camera::{Camera, CameraModel, KannalaBrandt};
 use crate::photographs::image::{Image, srgb_from_linear};
 use crate::{Error, Result};
 
+mod capture;
 mod colmap;
 mod lamp;
+mod night;
 mod room;
 mod shapes;
 mod street;
@@ -33,63 +39,29 @@ mod street;
 trait Scene: Sync {
     /// The linear radiance along a ray, in the light of the references, and in that of the photographs before they are
     /// darkened, which is that of a camera's lamp if it carries one.
-    fn radiance(&self, origin: DVec3, direction: DVec3, carried: Option<&CameraLamp>)
-    -> [DVec3; 2];
+    fn radiance(&self, origin: DVec3, direction: DVec3, lights: &ViewLights) -> [DVec3; 2];
 
     /// The first point along a ray.
     fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3>;
 
     /// The position of camera `view` of `views`, and the unit vector from what it looks at towards it.
     fn camera_position(&self, view: usize, views: usize) -> [DVec3; 2];
+
+    /// The radius of a street lamp, and the positions of all.
+    fn lamp_size(&self) -> f64;
+    fn street_lamps(&self) -> Vec<DVec3>;
+
+    /// The positions of the headlights that a camera at a position sees, by a draw in [0, 1).
+    fn headlights(&self, center: DVec3, along: f64) -> [DVec3; 2];
 }
 
 /// How much darker the dark photographs are, in linear light.
 pub const DARKENING: f64 = 25.0;
 
-/// Electrons of a pixel at the reference's white.
-const FULL_WELL: f64 = 9000.0;
-
-/// Standard deviation of the read noise, electrons.
-const READ_NOISE: f64 = 2.0;
-
-/// The exposure and noise of the dark photographs of a dataset.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Capture {
-    /// How much darker they are than the references, in linear light.
-    pub darkening: f64,
-    /// Electrons of a pixel at the reference's white: shot noise has the variance of signal / this.
-    pub full_well: f64,
-    /// Standard deviation of the read noise, electrons.
-    pub read_noise: f64,
-    /// Extra stops of the views, cyclically, from the first on.
-    pub stops: Vec<f64>,
-}
-
-/// A small sensor, far too short an exposure.
-impl Default for Capture {
-    fn default() -> Self {
-        Self {
-            darkening: DARKENING,
-            full_well: FULL_WELL,
-            read_noise: READ_NOISE,
-            stops: vec![0.0],
-        }
-    }
-}
-
-impl Capture {
-    /// Well lit, and without noise.
-    #[cfg(feature = "testing")]
-    pub fn clean() -> Self {
-        Self { darkening: 1.0, full_well: f64::INFINITY, read_noise: 0.0, ..Self::default() }
-    }
-}
-
 /// Every this many views, from the first, one is a test view.
 const TEST_EVERY: usize = 8;
 
-/// The streams of random numbers of the seed; the scene uses stream 0.
-const NOISE_STREAM: u64 = 1;
+/// The stream of random numbers of the seed for points; the scene uses stream 0, [`capture`] and [`night`] others.
 const POINT_STREAM: u64 = 2;
 
 /// Options of [`write()`].
@@ -111,6 +83,8 @@ pub struct SyntheticOptions {
     /// The photographs are lit by a lamp that is fixed to the camera, with half its strength this many degrees off its
     /// axis, 5 to 80. The cameras of a room then come close and look around.
     pub lamp: Option<f64>,
+    /// What the scene has at night; not with `lamp`.
+    pub night: Night,
 }
 
 impl Default for SyntheticOptions {
@@ -123,6 +97,7 @@ impl Default for SyntheticOptions {
             fisheye: false,
             street: None,
             lamp: None,
+            night: Night::NONE,
         }
     }
 }
@@ -148,7 +123,7 @@ impl SyntheticOptions {
         const VIEWS: RangeInclusive<usize> = 2..=99_999;
         const LAMPS: RangeInclusive<f64> = 5.0..=80.0;
         let refused = |what: String, remedy: String| Err(Error::Usage(format!("{what}; {remedy}")));
-        let Self { views, width, height, street, lamp, fisheye, .. } = *self;
+        let Self { views, width, height, street, lamp, fisheye, night, .. } = *self;
         if !VIEWS.contains(&views) {
             let remedy = format!("ask for 2 to {}", VIEWS.end());
             return refused(format!("{views} views cannot be made"), remedy);
@@ -169,6 +144,10 @@ impl SyntheticOptions {
             let what = format!("a lamp of half its strength at {degrees} degrees cannot be made");
             return refused(what, format!("ask for {} to {}", LAMPS.start(), LAMPS.end()));
         }
+        if lamp.is_some() && night != Night::NONE {
+            let what = "a night in the light of the camera's lamp is not made".to_owned();
+            return refused(what, "leave out --lamp, or the sky, lamps and haze".to_owned());
+        }
         Ok(())
     }
 }
@@ -187,7 +166,7 @@ pub fn write(dir: impl AsRef<Path>, options: &SyntheticOptions) -> Result<()> {
     write_captured(dir, options, &Capture::default())
 }
 
-/// As [`write()`], with another exposure and noise of the dark photographs.
+/// As [`write()`], with another exposure, noise and faults of the dark photographs.
 ///
 /// # Errors
 /// As [`write()`].
@@ -197,6 +176,7 @@ pub fn write_captured(
     capture: &Capture,
 ) -> Result<()> {
     options.check()?;
+    capture.check()?;
     let dir = dir.as_ref();
     let (low, high, sparse) = (dir.join("low"), dir.join("high"), dir.join("colmap_sparse/0"));
     let lit = options.lamp.map(|_| dir.join("lit"));
@@ -214,24 +194,23 @@ pub fn write_captured(
         }
     }
 
+    let (walked, sky, seed) = (options.lamp.is_some(), options.night.sky, options.seed);
     let (scene, draws): (Box<dyn Scene>, u64) = match options.street {
-        None => (Box::new(Room::new(options.seed, options.lamp.is_some())), 2400),
-        Some(plots) => (Box::new(Street::new(plots, options.seed)), 400 * u64::from(plots)),
+        None => (Box::new(Room::new(seed, walked, sky)), 2400),
+        Some(plots) => (Box::new(Street::new(plots, seed, sky)), 400 * u64::from(plots)),
     };
     let camera = |view| camera(scene.camera_position(view, options.views), options);
     let cameras: Vec<Camera> = (0..options.views).map(camera).collect();
     for (view, camera) in cameras.iter().enumerate() {
         let name = file_name(view, cameras.len());
-        let lamp = options.lamp.map(|degrees| CameraLamp::new(camera, degrees));
-        let [even, dim] = render(&*scene, camera, lamp.as_ref());
+        let lights = ViewLights::new(options, &*scene, camera, view);
+        let [even, dim] =
+            render(&*scene, camera, &lights).map(|light| capture.faults.channels(light));
         bright_photograph(&even, camera).save_png8(high.join(&name))?;
         if let Some(lit) = lit.as_ref().filter(|_| is_test(view)) {
             bright_photograph(&dim, camera).save_png8(lit.join(&name))?;
         }
-        let noise = Stream::new(options.seed, NOISE_STREAM << 32 | view as u64);
-        let stops = capture.stops.get(view % capture.stops.len().max(1)).copied();
-        let darkening = capture.darkening / stops.unwrap_or(0.0).exp2();
-        dark_photograph(&dim, camera, capture, darkening, noise).save_png8(low.join(&name))?;
+        capture.photograph(&dim, camera, view, seed).save_png8(low.join(&name))?;
     }
     for (name, text) in colmap::model(&*scene, &cameras, draws, options.seed) {
         write_file(&sparse.join(name), &text)?;
@@ -290,7 +269,7 @@ fn ray(camera: &Camera, pixel: DVec2) -> Option<DVec3> {
 }
 
 /// Linear radiance in row-major order, the mean of 2x2 rays per pixel, in both lights.
-fn render(scene: &dyn Scene, camera: &Camera, lamp: Option<&CameraLamp>) -> [Vec<DVec3>; 2] {
+fn render(scene: &dyn Scene, camera: &Camera, lights: &ViewLights) -> [Vec<DVec3>; 2] {
     const OFFSETS: [DVec2; 4] = [
         DVec2::new(0.25, 0.25),
         DVec2::new(0.75, 0.25),
@@ -302,7 +281,7 @@ fn render(scene: &dyn Scene, camera: &Camera, lamp: Option<&CameraLamp>) -> [Vec
         let corner = DVec2::new((index % camera.width).into(), (index / camera.width).into());
         let rays = OFFSETS.iter().filter_map(|&offset| ray(camera, corner + offset));
         let sums = rays
-            .map(|ray| scene.radiance(center, ray, lamp))
+            .map(|ray| lights.seen(scene, center, ray, scene.radiance(center, ray, lights)))
             .fold([DVec3::ZERO; 2], |sums, pair| [sums[0] + pair[0], sums[1] + pair[1]]);
         (sums[0] / 4.0, sums[1] / 4.0)
     };
@@ -313,25 +292,6 @@ fn render(scene: &dyn Scene, camera: &Camera, lamp: Option<&CameraLamp>) -> [Vec
 /// The normal-light photograph.
 fn bright_photograph(radiance: &[DVec3], camera: &Camera) -> Image {
     photograph(camera, |pixel, channel| radiance[pixel][channel])
-}
-
-/// The underexposed photograph.
-fn dark_photograph(
-    radiance: &[DVec3],
-    camera: &Camera,
-    &Capture { full_well, read_noise, .. }: &Capture,
-    darkening: f64,
-    noise: Stream,
-) -> Image {
-    if full_well.is_infinite() {
-        return photograph(camera, |pixel, channel| radiance[pixel][channel] / darkening);
-    }
-    photograph(camera, |pixel, channel| {
-        let electrons = full_well * radiance[pixel][channel] / darkening;
-        // Shot noise is Poisson; at tens of electrons, the normal distribution of equal variance is close.
-        let deviation = (electrons + read_noise * read_noise).sqrt();
-        (electrons + deviation * noise.normal(3 * pixel as u64 + channel as u64)) / full_well
-    })
 }
 
 /// An image of linear values at (pixel, channel), encoded, clamped to [0, 1].

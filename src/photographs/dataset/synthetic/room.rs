@@ -7,8 +7,11 @@ use std::f64::consts::{PI, TAU};
 use glam::{DMat3, DVec2, DVec3};
 
 use super::Scene;
-use super::lamp::{self, CameraLamp};
-use super::shapes::{SceneSurface, SurfaceShape, TextureNoise, nearest, open_beside, smoothstep};
+use super::lamp;
+use super::night::ViewLights;
+use super::shapes::{
+    Hit, SceneSurface, SurfaceShape, TextureNoise, nearest, open_beside, smoothstep,
+};
 use crate::base::random::Stream;
 
 /// The look of a surface.
@@ -27,7 +30,12 @@ pub(super) struct Room {
     noise: TextureNoise,
     /// Whether the cameras come close and turn, as those of who carries a lamp.
     is_walked: bool,
+    /// Whether it is a yard under the sky: its walls end at [`WALL`], and the cameras are low and look up.
+    is_open: bool,
 }
+
+/// The height of the walls of a yard, which no camera is above.
+const WALL: f64 = 1.2;
 
 /// The point that the cameras look at.
 const FOCUS: DVec3 = DVec3::new(0.0, 0.3, 0.5);
@@ -41,8 +49,8 @@ const SKY_RADIANCE: DVec3 = DVec3::new(0.12, 0.135, 0.165);
 const GROUND_RADIANCE: DVec3 = DVec3::new(0.07, 0.055, 0.04);
 
 impl Room {
-    /// The room whose textures are drawn from `seed`; its cameras are at about one distance, or walk through it.
-    pub(super) fn new(seed: u64, is_walked: bool) -> Self {
+    /// The room, or a yard, whose textures are drawn from `seed`; its cameras are at about one distance, or walk.
+    pub(super) fn new(seed: u64, is_walked: bool, is_open: bool) -> Self {
         let plane = |normal, offset, albedo| SceneSurface {
             shape: SurfaceShape::Plane { normal, offset },
             material: RoomMaterial { albedo, gloss: 0.0 },
@@ -66,7 +74,19 @@ impl Room {
             block(DVec3::new(0.95, 0.45, 0.42), DVec3::new(0.5, 0.4, 0.42), 0.45, Self::checker),
             block(DVec3::new(0.12, 1.1, 0.62), DVec3::new(0.32, 0.2, 0.62), -0.3, Self::bands),
         ];
-        Self { surfaces, lamp: lamp_places(), noise: TextureNoise(Stream::new(seed, 0)), is_walked }
+        let noise = TextureNoise(Stream::new(seed, 0));
+        Self { surfaces, lamp: lamp_places(), noise, is_walked, is_open }
+    }
+
+    /// The first surface along a ray.
+    fn nearest(
+        &self,
+        origin: DVec3,
+        direction: DVec3,
+    ) -> Option<(&SceneSurface<RoomMaterial>, Hit)> {
+        let height = |hit: &Hit| origin.z + hit.distance * direction.z;
+        nearest(self.surfaces.iter(), origin, direction)
+            .filter(|(_, hit)| !self.is_open || height(hit) < WALL || hit.normal.z > 0.0)
     }
 
     /// The lamp's diffuse light (1 if perpendicular and unoccluded) and its highlight at a position.
@@ -217,23 +237,20 @@ impl Room {
 }
 
 impl Scene for Room {
-    fn radiance(
-        &self,
-        origin: DVec3,
-        direction: DVec3,
-        carried: Option<&CameraLamp>,
-    ) -> [DVec3; 2] {
-        let Some((surface, hit)) = nearest(self.surfaces.iter(), origin, direction) else {
-            return [SKY_RADIANCE; 2];
+    fn radiance(&self, origin: DVec3, direction: DVec3, lights: &ViewLights) -> [DVec3; 2] {
+        let Some((surface, hit)) = self.nearest(origin, direction) else {
+            return [lights.sky(direction).unwrap_or(SKY_RADIANCE); 2];
         };
         let position = origin + hit.distance * direction;
         let albedo = (surface.material.albedo)(self, hit.position);
         let up = 0.5 + 0.5 * hit.normal.z;
         let ambient = GROUND_RADIANCE.lerp(SKY_RADIANCE, up) * self.openness(position, hit.normal);
         let (lit, highlight) = self.lamp(position, hit.normal, direction, surface.material.gloss);
-        let radiance = albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * highlight;
-        let Some(carried) = carried else { return [radiance; 2] };
         let is_clear = |start, direction, distance| self.is_clear(start, direction, distance);
+        let nearby = lights.irradiance(position, hit.normal, is_clear);
+        let radiance =
+            albedo * (ambient + LAMP_RADIANCE * lit + nearby) + LAMP_RADIANCE * highlight;
+        let Some(carried) = &lights.carried else { return [radiance; 2] };
         let light = carried.light(position, hit.normal, is_clear).map(|light| {
             let shine = surface.material.gloss * shine(light.to_lamp, hit.normal, direction);
             light.radiance * (albedo * light.cosine + shine)
@@ -242,8 +259,7 @@ impl Scene for Room {
     }
 
     fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {
-        nearest(self.surfaces.iter(), origin, direction)
-            .map(|(_, hit)| origin + hit.distance * direction)
+        self.nearest(origin, direction).map(|(_, hit)| origin + hit.distance * direction)
     }
 
     /// Cameras on a part of a sphere in front of the scene, spread evenly by a low-discrepancy sequence (Roberts' R2),
@@ -251,11 +267,14 @@ impl Scene for Room {
     fn camera_position(&self, view: usize, _views: usize) -> [DVec3; 2] {
         const AZIMUTH: f64 = 0.75; // radians to either side
         const ELEVATION: (f64, f64) = (0.24, 0.62); // radians
+        const ELEVATION_OPEN: (f64, f64) = (0.02, 0.18);
+        const UPWARD: f64 = 0.1; // radians, of the cameras of a yard
         const BESIDE: DVec3 = DVec3::new(1.3, 0.0, 0.7);
         let fraction = |step: f64| (0.5 + step * view as f64).fract();
         let between = |(low, high): (f64, f64), step| low + (high - low) * fraction(step);
         let azimuth = AZIMUTH * (2.0 * fraction(0.754_877_666) - 1.0);
-        let elevation = between(ELEVATION, 0.569_840_291);
+        let range = if self.is_open { ELEVATION_OPEN } else { ELEVATION };
+        let elevation = between(range, 0.569_840_291);
         let distance = match self.is_walked {
             true => between((1.8, 4.0), 0.671_043_607),
             false => between((2.95, 3.45), 0.381_966_011),
@@ -263,11 +282,27 @@ impl Scene for Room {
         let (sin, cos) = azimuth.sin_cos();
         let back = DVec3::new(sin * elevation.cos(), -cos * elevation.cos(), elevation.sin());
         let center = FOCUS + distance * back;
+        if self.is_open {
+            let level = DVec2::new(sin, -cos) * UPWARD.cos();
+            return [center, level.extend(-UPWARD.sin())];
+        }
         if !self.is_walked {
             return [center, back];
         }
         let beside = DVec3::new(fraction(0.430_159_709) - 0.5, 0.0, fraction(0.381_966_011) - 0.5);
         [center, (center - FOCUS - BESIDE * beside).normalize()]
+    }
+
+    fn lamp_size(&self) -> f64 {
+        0.07
+    }
+
+    fn street_lamps(&self) -> Vec<DVec3> {
+        vec![DVec3::new(0.4, 0.7, 1.45)]
+    }
+
+    fn headlights(&self, _center: DVec3, along: f64) -> [DVec3; 2] {
+        [-1.32, -1.08].map(|x| DVec3::new(2.4 * along + x, -0.1, 0.9))
     }
 }
 

@@ -6,7 +6,8 @@
 use glam::{DMat3, DVec2, DVec3};
 
 use super::Scene;
-use super::lamp::{self, CameraLamp};
+use super::lamp;
+use super::night::ViewLights;
 use super::shapes::{
     Hit, SceneSurface, SurfaceShape, TextureNoise, nearest, open_beside, smoothstep,
 };
@@ -47,11 +48,14 @@ pub(super) struct Street {
     ground: [SceneSurface<StreetMaterial>; 1],
     noise: TextureNoise,
     length: f64,
+    /// Whether the cameras see the sky: they are above the houses and look level across the street, whose light then
+    /// is the same everywhere.
+    is_open: bool,
 }
 
 impl Street {
     /// The street of this many plots whose houses and textures are drawn from `seed`.
-    pub(super) fn new(plots: u32, seed: u64) -> Self {
+    pub(super) fn new(plots: u32, seed: u64, is_open: bool) -> Self {
         let stream = Stream::new(seed, 0);
         let ground = SceneSurface {
             shape: SurfaceShape::Plane { normal: DVec3::Z, offset: 0.0 },
@@ -67,6 +71,7 @@ impl Street {
             ground: [ground],
             noise: TextureNoise(stream),
             length: plots.into(),
+            is_open,
         }
     }
 
@@ -161,15 +166,12 @@ impl Street {
 }
 
 impl Scene for Street {
-    fn radiance(
-        &self,
-        origin: DVec3,
-        direction: DVec3,
-        carried: Option<&CameraLamp>,
-    ) -> [DVec3; 2] {
+    fn radiance(&self, origin: DVec3, direction: DVec3, lights: &ViewLights) -> [DVec3; 2] {
         let Some((surface, hit)) = self.nearest(origin, direction) else {
-            let share = carried.map_or(1.0, |_| lamp::AMBIENT);
-            return [SKY_RADIANCE, share * SKY_RADIANCE];
+            let share = lights.carried.as_ref().map_or(1.0, |_| lamp::AMBIENT);
+            return lights
+                .sky(direction)
+                .map_or([SKY_RADIANCE, share * SKY_RADIANCE], |sky| [sky; 2]);
         };
         let position = origin + hit.distance * direction;
         let albedo = (surface.material.albedo)(self, hit.position, &surface.material);
@@ -179,12 +181,14 @@ impl Scene for Street {
         let lit = cosine > 0.0 && self.nearest(position + 1e-6 * hit.normal, SUN).is_none();
         let sun = if lit { SUN_RADIANCE * cosine } else { DVec3::ZERO };
         let radiance = albedo * (ambient + sun);
-        let Some(carried) = carried else {
-            return [radiance, radiance * FALL.powf(0.5 - position.x / self.length)];
-        };
         let is_clear = |start, direction, distance| {
             let first = self.nearest(start, direction);
             first.is_none_or(|(_, hit)| hit.distance > distance)
+        };
+        let Some(carried) = &lights.carried else {
+            let nearby = albedo * lights.irradiance(position, hit.normal, is_clear);
+            let fall = if self.is_open { 0.0 } else { 0.5 - position.x / self.length };
+            return [radiance + nearby, radiance * FALL.powf(fall) + nearby];
         };
         let light = carried.light(position, hit.normal, is_clear);
         let light = light.map_or(DVec3::ZERO, |light| light.radiance * light.cosine);
@@ -202,9 +206,29 @@ impl Scene for Street {
         let [a, b, c] = [0.754_877_666, 0.569_840_291, 0.381_966_011].map(fraction);
         let side = (view % 3) as f64 - 1.0;
         let x = self.length * (view as f64 + 0.5) / views as f64;
+        if self.is_open {
+            let across = a.signum();
+            let center = DVec3::new(x, across * 3.1 + 0.3 * a, 1.25 + 0.1 * b);
+            return [center, DVec3::new(-0.3 * c, across, -0.02).normalize()];
+        }
         let center = DVec3::new(x, 1.15 * side + 0.15 * a, 1.95 + 0.2 * b);
         let target = DVec3::new(x + 0.55 * c, -0.55 * side, 0.25);
         [center, (center - target).normalize()]
+    }
+
+    fn lamp_size(&self) -> f64 {
+        0.04
+    }
+
+    /// Beside the road, every third plot.
+    fn street_lamps(&self) -> Vec<DVec3> {
+        let x = (0..self.plots.len()).step_by(3).map(|plot| plot as f64 + 1.5 - BEYOND as f64);
+        x.map(|x| DVec3::new(x, 0.62, 0.72)).collect()
+    }
+
+    fn headlights(&self, center: DVec3, along: f64) -> [DVec3; 2] {
+        let x = center.x + 1.6 * along - 0.8;
+        [0.24, 0.36].map(|y| DVec3::new(x, -y * center.y.signum(), 0.1))
     }
 }
 
