@@ -1,5 +1,5 @@
-// The tone curves: from an sRGB-encoded dark value to the pseudo-GT value in [0, 1]. The statistics in the parameters
-// are measured once per view; `tone::ToneCurve` is the host side.
+// The tone curves: from an sRGB-encoded dark value, at least 0, to the pseudo-GT value in [0, 1]. The statistics in the
+// parameters are measured once per view; `tone::ToneCurve` is the host side.
 
 #include "curves.glsl"
 
