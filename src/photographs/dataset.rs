@@ -47,8 +47,8 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 
 use crate::camera::Lens;
-use crate::photographs::image::{Levels, MaskFile};
 use crate::photographs::image::files::PhotographFiles;
+use crate::photographs::image::{Levels, MaskFile};
 use crate::photographs::white_balance::{WhiteBalance, WhiteBalanceGains};
 use crate::{Error, Result};
 pub(crate) use borders::Borders;
@@ -153,11 +153,13 @@ impl Dataset {
         let Listing { frames, mut skipped, remarks, clouds, has_split } =
             select(&layout, options, &files)?;
         log_split(&layout.root, has_split, options);
-        let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
+        let mut sources = sources(&layout.root, &frames, options, &files, &mut skipped);
+        let headers = pixels::headers(&mut sources);
         let mut levels = levels(&layout, &sources, options, &files)?;
         let gains = white_balance_gains(&layout.root, &sources, options, levels)?;
+        let files = (sources, headers);
         let views =
-            pixels::load(sources, &layout, options, observer, &mut levels, gains, &mut skipped)?;
+            pixels::load(files, &layout, options, observer, &mut levels, gains, &mut skipped)?;
         if !views.iter().any(|view| view.split == Split::Train) {
             let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
             let problem = format!(
@@ -281,7 +283,7 @@ fn levels(
 ) -> Result<Levels> {
     let of = |sources: &[ViewFiles]| {
         let training = sources.iter().filter(|source| source.split == Split::Train);
-        Levels::of_set(options.light, training.filter_map(|source| source.input.as_deref()))
+        Levels::of_set(options.light, training.filter_map(ViewFiles::photograph))
     };
     if layout.block.is_none() {
         return Ok(of(sources_of_views));

@@ -40,7 +40,8 @@ use rayon::prelude::*;
 pub(crate) use {codec::PictureFile, colour::ColourCounts, levels::Levels, mask::MaskFile};
 #[cfg(feature = "io")]
 pub use {
-    exif::exposure_value, jpeg::exif_segment, levels::StoredLight, mask::Mask, orientation::Orientation,
+    exif::exposure_value, jpeg::exif_segment, levels::StoredLight, mask::Mask,
+    orientation::Orientation,
 };
 
 /// A colour image: planes of red, green and blue, sRGB-encoded, in [0, 1]. Values of RAW and float files may exceed 1,
@@ -78,7 +79,8 @@ pub fn srgb_from_linear(linear: f32) -> f32 {
 /// The linear light of an sRGB-encoded value.
 pub fn linear_from_srgb(srgb: f32) -> f32 {
     let value = srgb.abs();
-    let linear = if value <= 0.040_45 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) };
+    let linear =
+        if value <= 0.040_45 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) };
     linear.copysign(srgb)
 }
 
@@ -201,7 +203,8 @@ mod tests {
             let srgb = step as f32 / 1000.0;
             assert_eq!(linear_from_srgb(-srgb), -linear_from_srgb(srgb));
             assert!(
-                (srgb_from_linear(linear_from_srgb(srgb)) - srgb).abs() < 2e-6 * srgb.abs().max(1.0),
+                (srgb_from_linear(linear_from_srgb(srgb)) - srgb).abs()
+                    < 2e-6 * srgb.abs().max(1.0),
                 "{srgb}"
             );
         }

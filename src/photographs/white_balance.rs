@@ -98,8 +98,7 @@ impl WhiteBalance {
         let mut count = 0.0;
         for patch in &pixels {
             let colours = patch.iter().map(|&[x, y]| image.pixel(x, y));
-            let usable =
-                |colour: &[f32; 3]| colour.iter().all(|value| *value < CLIPPED);
+            let usable = |colour: &[f32; 3]| colour.iter().all(|value| *value < CLIPPED);
             let colours: Vec<[f32; 3]> = colours.filter(usable).collect();
             // The rest of a partly clipped patch would be biased to its dark pixels.
             if 2 * colours.len() < patch.len() {
@@ -350,7 +349,9 @@ mod tests {
 
     #[test]
     fn gains_neutralise_the_light_of_a_temperature() {
-        let of = |kelvin: f64| WhiteBalance::Kelvin(kelvin).gains(Path::new(""), [], Levels::default()).unwrap().0;
+        let of = |kelvin: f64| {
+            WhiteBalance::Kelvin(kelvin).gains(Path::new(""), [], Levels::default()).unwrap().0
+        };
         assert!(of(6504.0).iter().all(|gain| (gain - 1.0).abs() < 1e-3), "{:?}", of(6504.0));
         // Illuminant A, 2856 K: x = 0.44757, y = 0.40745, relative to D65.
         let [red, green, blue] = of(2856.0);

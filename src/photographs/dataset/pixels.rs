@@ -37,10 +37,19 @@ const BYTES_PER_PIXEL: u64 = 12;
 /// Sees a training photograph as it is stored, with its mask, while it is decoded; from any thread.
 pub(crate) type PhotographObserver<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>) + Sync);
 
+/// The headers of photograph and reference image of each view.
+type Headers = Vec<[Option<ImageHeader>; 2]>;
+
+/// Reads the files while memory allows.
+pub(super) fn headers(sources: &mut [ViewFiles]) -> Headers {
+    let memory = Allowance::new(MAX_READ);
+    sources.par_iter_mut().map(|source| source.headers(&memory)).collect()
+}
+
 /// The views in order of name. Files that cannot be decoded are named in `skipped`. Levels that a photograph exceeds
 /// become those of its format, and all are decoded again.
 pub(super) fn load(
-    sources: Vec<ViewFiles>,
+    (sources, headers): (Vec<ViewFiles>, Headers),
     layout: &DatasetLayout,
     options: &LoadOptions,
     observer: Option<PhotographObserver<'_>>,
@@ -50,21 +59,28 @@ pub(super) fn load(
 ) -> Result<Vec<View>> {
     let others = skipped.len();
     if levels.are_limits() {
-        let views =
-            load_with(sources.clone(), layout, options, observer, *levels, gains, skipped)?;
+        let views = load_with(
+            (sources.clone(), headers.clone()),
+            layout,
+            options,
+            observer,
+            *levels,
+            gains,
+            skipped,
+        )?;
         if let Some(views) = views {
             return Ok(views);
         }
         skipped.truncate(others);
         *levels = Levels::as_stored(options.light);
     }
-    let views = load_with(sources, layout, options, observer, *levels, gains, skipped)?;
+    let views = load_with((sources, headers), layout, options, observer, *levels, gains, skipped)?;
     Ok(views.unwrap_or_default())
 }
 
 /// The views at these levels; `None` if a photograph exceeds them.
 fn load_with(
-    mut sources: Vec<ViewFiles>,
+    (sources, headers): (Vec<ViewFiles>, Headers),
     layout: &DatasetLayout,
     options: &LoadOptions,
     observer: Option<PhotographObserver<'_>>,
@@ -72,9 +88,6 @@ fn load_with(
     gains: Option<WhiteBalanceGains>,
     skipped: &mut Vec<String>,
 ) -> Result<Option<Vec<View>>> {
-    let memory = Allowance::new(MAX_READ);
-    let headers: Vec<[Option<ImageHeader>; 2]> =
-        sources.par_iter_mut().map(|source| source.headers(&memory)).collect();
     let of_photographs: Vec<Option<ImageHeader>> =
         headers.iter().map(|[photograph, _]| *photograph).collect();
     let points = || points::of_sources(layout, &sources);

@@ -68,12 +68,7 @@ impl PictureFile {
     }
 }
 
-fn decode(
-    path: &Path,
-    bytes: Vec<u8>,
-    meaning: Meaning,
-    levels: &Levels,
-) -> Result<DecodedImage> {
+fn decode(path: &Path, bytes: Vec<u8>, meaning: Meaning, levels: &Levels) -> Result<DecodedImage> {
     budget::check(path, &bytes)?;
     if bytes.starts_with(&exr_file::MAGIC) {
         return exr_file::load(path, bytes, meaning, levels);
@@ -112,8 +107,9 @@ fn decode(
 fn one_value(image: &Image) -> Option<String> {
     let [least, most] = extremes(image);
     let code = (65_535.0 * most).round();
-    (least == most)
-        .then(|| format!("every value is {code} of 65535: it shows nothing; leave it out or export it again"))
+    (least == most).then(|| {
+        format!("every value is {code} of 65535: it shows nothing; leave it out or export it again")
+    })
 }
 
 /// The alpha of a decoded image in all three planes; `None` if it is opaque.
@@ -439,7 +435,57 @@ mod tests {
         let [red, green, blue] = Image::load(&path).unwrap().pixel(2, 1);
         assert!((red - 0.735_357).abs() < 1e-5 && red == green && green == blue);
         save("Z");
-        assert!(Image::load(&path).unwrap_err().to_string().contains("neither R nor Y"));
+        let error = Image::load(&path).unwrap_err().to_string();
+        assert!(error.contains("neither R nor Y, but Z;"), "{error}");
+    }
+
+    #[test]
+    fn the_picture_of_an_exr_with_layers_is_read_where_only_one_can_be_meant() {
+        use exr::prelude::{AnyChannel, AnyChannels, FlatSamples, WritableImage};
+        let (path, _folder) = file("a.exr");
+        let loaded = |groups: &[&str]| {
+            let channel = |(value, name): (usize, String)| {
+                AnyChannel::new(name.as_str(), FlatSamples::F32(vec![value as f32 / 16.0; 6]))
+            };
+            let names =
+                groups.iter().flat_map(|group| ["R", "G", "B"].map(|c| format!("{group}{c}")));
+            let channels = (1..).zip(names).map(channel).collect();
+            let channels = AnyChannels::sort(channels);
+            exr::image::Image::from_channels((3, 2), channels).write().to_file(&path).unwrap();
+            Image::load(&path).map(|image| image.pixel(2, 1).map(linear_from_srgb))
+        };
+        let close = |found: [f32; 3], expected: [f32; 3]| {
+            found.iter().zip(expected).all(|(a, b)| (a - b / 16.0).abs() < 1e-6)
+        };
+        assert!(close(loaded(&["ViewLayer.Combined."]).unwrap(), [1.0, 2.0, 3.0]));
+        assert!(close(loaded(&["A.Diffuse.", "A.Combined."]).unwrap(), [4.0, 5.0, 6.0]));
+        let error = loaded(&["Left.", "Right."]).unwrap_err().to_string();
+        assert!(error.contains("but Left.B, Left.G, Left.R, Right.B"), "{error}");
+    }
+
+    #[test]
+    fn a_file_that_shows_nothing_is_named() {
+        let (path, _folder) = file("a");
+        let remark = |save: &dyn Fn()| {
+            save();
+            let bytes = std::fs::read(&path).unwrap();
+            let decoded = decode(&path, bytes, Meaning::Colour, &Levels::default());
+            decoded.unwrap().remark.unwrap_or_default()
+        };
+        let exr = |value: &dyn Fn(u32) -> f32| {
+            let image = Image::from_fn(4, 1, |x, _| [value(x); 3]);
+            remark(&|| image.save_exr_as_stored(&path).unwrap())
+        };
+        let one = Image::filled(4, 4, [700.0 / 65_535.0; 3]);
+        let sixteen = remark(&|| one.save_png16(&path).unwrap());
+        assert!(sixteen.contains("every value is 700 of 65535"), "{sixteen}");
+        assert_eq!(remark(&|| gradient(4, 4).save_png16(&path).unwrap()), "");
+        assert!(exr(&|_| 0.25).contains("every value is 0.25"));
+        assert!(exr(&|x| -1.0 - x as f32).contains("every value is negative, -1 at most"));
+        assert!(
+            exr(&|x| if x == 1 { f32::NAN } else { x as f32 }).contains("3 values are not finite")
+        );
+        assert_eq!(exr(&|x| x as f32 - 1.0), "");
     }
 
     #[test]

@@ -41,9 +41,9 @@ pub(super) fn load(
     let remark = match extremes(&image) {
         _ if replaced > 0 => Some(format!("{replaced} values are not finite: masked")),
         _ if meaning == Meaning::Number => None,
-        [least, most] if least == most => {
-            Some(format!("every value is {most}: it shows nothing; leave it out or export it again"))
-        }
+        [least, most] if least == most => Some(format!(
+            "every value is {most}: it shows nothing; leave it out or export it again"
+        )),
         [_, most] if most < 0.0 => {
             Some(format!("every value is negative, {most} at most: it is black; export it again"))
         }

@@ -99,8 +99,9 @@ pub(super) fn extremes(image: &Image) -> [f32; 2] {
     image.data.iter().fold([f32::INFINITY, f32::NEG_INFINITY], both)
 }
 
-/// Photographs that are looked at, of a set in question.
+/// Photographs that are looked at, of a set in question, and how many have to agree by more than chance.
 const LOOKED_AT: usize = 8;
+const NEEDED: usize = 3;
 /// About how many values of a photograph are sorted for its quantiles.
 const QUANTILES_OF: usize = 1 << 16;
 /// The range of video in 8 bits.
@@ -122,23 +123,24 @@ impl Levels {
         Self { light, found: None }
     }
 
-    /// The levels of a set, from some of its photographs; `srgb` says that they are as stored.
+    /// The levels of a set, from some of its photographs, each with its file if that is already read; `srgb` says that
+    /// they are as stored.
     pub(crate) fn of_set<'a>(
         light: Option<StoredLight>,
-        photographs: impl IntoIterator<Item = &'a Path>,
+        photographs: impl IntoIterator<Item = (&'a Path, Option<&'a PictureFile>)>,
     ) -> Self {
         let plain = Self::as_stored(light);
         if light == Some(StoredLight::Srgb) {
             return plain;
         }
         // A sensor's file states its levels.
-        let photographs = photographs.into_iter().filter(|path| !is_raw(path));
-        let photographs: Vec<&Path> = photographs.collect();
+        let photographs = photographs.into_iter().filter(|(path, _)| !is_raw(path));
+        let photographs: Vec<_> = photographs.collect();
         let step = photographs.len().div_ceil(LOOKED_AT).max(1);
         let mut looks: Vec<PhotographLevels> = vec![];
-        for path in photographs.into_iter().step_by(step) {
+        for (path, read) in photographs.into_iter().step_by(step) {
             // What cannot be read is named when it is decoded.
-            let Some(look) = PhotographLevels::of_file(path) else { continue };
+            let Some(look) = PhotographLevels::of_file(path, read) else { continue };
             if looks.first().is_some_and(|first| first.format != look.format) || look.is_plain() {
                 return plain;
             }
@@ -150,12 +152,12 @@ impl Levels {
     /// [`Levels::of_set`], with every photograph looked at if their values are in question: for a set whose photographs
     /// are not decoded together.
     pub(crate) fn of_all(light: Option<StoredLight>, photographs: &[&Path]) -> Self {
-        let levels = Self::of_set(light, photographs.iter().copied());
+        let levels = Self::of_set(light, photographs.iter().map(|path| (*path, None)));
         let Some(FoundLevels { black, white, are_limits: true, format }) = levels.found else {
             return levels;
         };
         let is_within = |path: &&Path| {
-            let look = PhotographLevels::of_file(path).filter(|look| look.format == format);
+            let look = PhotographLevels::of_file(path, None).filter(|look| look.format == format);
             look.is_none_or(|look| look.least >= black && look.most <= white)
         };
         if photographs.par_iter().all(is_within) { levels } else { Self::as_stored(light) }
@@ -220,8 +222,8 @@ impl Levels {
             let FoundLevels { black, white, are_limits, .. } = found;
             let (scale, range) = (format.largest(), white - black);
             let code = |x: f32| if format == SampleFormat::Float { x } else { (x * scale).round() };
-            is_beyond = are_limits
-                && image.data.par_iter().any(|&x| !(black..=white).contains(&code(x)));
+            is_beyond =
+                are_limits && image.data.par_iter().any(|&x| !(black..=white).contains(&code(x)));
             image.data.par_iter_mut().for_each(|x| *x = (code(*x) - black) / range);
         }
         if self.are_linear() && format != SampleFormat::Float {
@@ -244,8 +246,9 @@ struct PhotographLevels {
 }
 
 impl PhotographLevels {
-    fn of_file(path: &Path) -> Option<Self> {
-        let (image, format) = PictureFile::open(path).ok()?.decode_as_stored().ok()?;
+    fn of_file(path: &Path, read: Option<&PictureFile>) -> Option<Self> {
+        let file = read.map_or_else(|| PictureFile::open(path), |file| Ok(file.clone()));
+        let (image, format) = file.ok()?.decode_as_stored().ok()?;
         let format = format?;
         let code = |x: &f32| match format {
             SampleFormat::Float => *x,
@@ -253,7 +256,7 @@ impl PhotographLevels {
         };
         let [least, most] = extremes(&image);
         let mut codes: Vec<f32> =
-            image.data.iter().step_by(image.data.len() / QUANTILES_OF | 1).map(code).collect();
+            image.data.iter().step_by((image.data.len() / QUANTILES_OF) | 1).map(code).collect();
         codes.sort_unstable_by(f32::total_cmp);
         let last = codes.len().checked_sub(1)?;
         let quantile = |part: f64| codes[(part * last as f64) as usize];
@@ -274,7 +277,7 @@ impl PhotographLevels {
                 let [low, _, _, high] = self.quantiles;
                 self.are_bytes || self.most > largest_of(SENSOR_BITS[2]) && low <= NARROW * high
             }
-            SampleFormat::Float => self.quantiles[1] <= 1.0,
+            SampleFormat::Float => self.quantiles[1] <= 0.5,
         }
     }
 }
@@ -290,11 +293,13 @@ impl FoundLevels {
             photographs.iter().filter(|one| is(one)).count()
         };
         let most = photographs.iter().fold(0.0, |most, one| one.most.max(most));
+        let has_several = photographs.len() >= NEEDED;
         let limits = |black, white| Some(Self { format, black, white, are_limits: true });
         match format {
             SampleFormat::Eight => {
-                let reach_black = count(&|one| one.least == VIDEO[0]);
-                (2 * reach_black > photographs.len()).then(|| limits(VIDEO[0], VIDEO[1])).flatten()
+                let reach_black = count(&|one| one.least < VIDEO[0] + 0.5);
+                let is_video = has_several && 2 * reach_black > photographs.len();
+                is_video.then(|| limits(VIDEO[0], VIDEO[1])).flatten()
             }
             SampleFormat::Sixteen => {
                 let bits = SENSOR_BITS.into_iter().find(|&bits| most <= largest_of(bits));
@@ -302,7 +307,8 @@ impl FoundLevels {
                 let reach = |white: f32| count(&|one| one.most >= (1.0 - TOP) * white);
                 let black = count(&|one| one.quantiles[2] < ENCODED_BLACK * format.largest());
                 let is_white = |white: &f32| {
-                    2 * reach(*white) >= photographs.len() || black == photographs.len()
+                    has_several && 2 * reach(*white) >= photographs.len()
+                        || black == photographs.len()
                 };
                 let low = photographs.iter().fold(f32::MAX, |low, one| one.quantiles[0].min(low));
                 let high = photographs.iter().fold(0.0, |high, one| one.quantiles[3].max(high));
@@ -318,10 +324,12 @@ impl FoundLevels {
                 }
             }
             SampleFormat::Float => {
-                let mut medians: Vec<f32> = photographs.iter().map(|one| one.quantiles[1]).collect();
+                let mut medians: Vec<f32> =
+                    photographs.iter().map(|one| one.quantiles[1]).collect();
                 medians.sort_unstable_by(f32::total_cmp);
-                let white = medians[medians.len() / 2] / DARK;
-                Some(Self { format, black: 0.0, white, are_limits: false })
+                let median = medians[medians.len() / 2];
+                let white = median / DARK;
+                (median > 1.0).then_some(Self { format, black: 0.0, white, are_limits: false })
             }
         }
     }
@@ -347,8 +355,9 @@ mod tests {
                 match is_wide {
                     true => ImageBuffer::from_fn(64, 64, |x, y| Rgb([pixel(x, y) as u16; 3]))
                         .save(&path),
-                    false => ImageBuffer::from_fn(64, 64, |x, y| Rgb([pixel(x, y) as u8; 3]))
-                        .save(&path),
+                    false => {
+                        ImageBuffer::from_fn(64, 64, |x, y| Rgb([pixel(x, y) as u8; 3])).save(&path)
+                    }
                 }
                 .unwrap();
                 path
@@ -379,21 +388,27 @@ mod tests {
         let found = |code: &dyn Fn(u32, u32) -> u32| Set::new(9, true, code).found();
         // A sensor that clips, in most photographs; and one in the dark.
         let clipped = |bits: u32| {
-            move |one, at| dark(one, at, if one == 1 { 900 } else { 5 << (bits - 2) }).min((1 << bits) - 1)
+            move |one, at| {
+                dark(one, at, if one == 1 { 900 } else { 5 << (bits - 2) }).min((1 << bits) - 1)
+            }
         };
         for (bits, white) in [(10, 1023.0), (12, 4095.0), (14, 16_383.0)] {
             assert_eq!(found(&clipped(bits)), Some([0.0, white]), "{bits} bits");
         }
         assert_eq!(found(&|one, at| dark(one, at, 80)), Some([0.0, 1023.0]));
-        assert_eq!(found(&|one, at| dark(one, at, 450) + if at == 9 { 1500 } else { 0 }), Some([0.0, 4095.0]));
+        assert_eq!(
+            found(&|one, at| dark(one, at, 450) + if at == 9 { 1500 } else { 0 }),
+            Some([0.0, 4095.0])
+        );
         // Dark, encoded on the full scale, with any largest value below 4095; 8 bits in 16; bright.
         assert_eq!(found(&|one, at| dark(one, at, 1800 + 250 * one)), None);
         assert_eq!(found(&|one, at| 257 * dark(one, at, 3)), None);
         assert_eq!(found(&|one, at| dark(one, at, 65_000)), None);
         // One photograph that is not of the first that are looked at has more.
-        let beyond = Set::new(17, true, |one, at| dark(one, at, 80) + if one == 1 { 1000 } else { 0 });
+        let beyond =
+            Set::new(17, true, |one, at| dark(one, at, 80) + if one == 1 { 1000 } else { 0 });
         assert_eq!(beyond.found(), None);
-        let some = Levels::of_set(None, beyond.1.iter().map(PathBuf::as_path));
+        let some = Levels::of_set(None, beyond.1.iter().map(|path| (path.as_path(), None)));
         let photograph = |at: usize| {
             let colours = super::super::ColourCounts::of_levels(some);
             let file = PictureFile::open(&beyond.1[at]).unwrap();
@@ -438,7 +453,7 @@ mod tests {
                 path
             };
             let paths: Vec<PathBuf> = (0..4).map(path).collect();
-            (Levels::of_set(None, paths.iter().map(PathBuf::as_path)), paths)
+            (Levels::of_set(None, paths.iter().map(|path| (path.as_path(), None))), paths)
         };
         let (plain, _) = set(1e-4);
         assert_eq!(plain, Levels::default());

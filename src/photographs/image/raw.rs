@@ -69,7 +69,8 @@ pub(super) fn load(path: &Path, bytes: Vec<u8>) -> Result<Image> {
 fn above_black(raw: &RawImage) -> Vec<f32> {
     let (black, white) = (raw.blacklevel.as_vec(), raw.whitelevel.as_vec());
     let (columns, rows) = (raw.blacklevel.width, raw.blacklevel.height);
-    let has_four = white.len() == 4 && matches!(raw.photometric, RawPhotometricInterpretation::Cfa(_));
+    let has_four =
+        white.len() == 4 && matches!(raw.photometric, RawPhotometricInterpretation::Cfa(_));
     let level = |at: usize| {
         let (pixel, color) = (at / raw.cpp, at % raw.cpp);
         let (x, y) = (pixel % raw.width, pixel / raw.width);
@@ -107,10 +108,10 @@ fn srgb_from_camera<const N: usize>(raw: &RawImage) -> [[f32; N]; 3] {
     let found = raw.color_matrix_find_first(ILLUMINANTS);
     let (light, mut camera_from_xyz) =
         found.unwrap_or_else(|| (Illuminant::D65, IDENTITY_MATRIX_3.as_flattened().to_vec()));
-    let of_other_light = transform_1d::<3, 3>(&camera_from_xyz).filter(|_| light != Illuminant::D65);
+    let of_other_light =
+        transform_1d::<3, 3>(&camera_from_xyz).filter(|_| light != Illuminant::D65);
     if let Some(matrix) = of_other_light {
-        camera_from_xyz =
-            adapt_bradford(&light, &Illuminant::D65, &matrix).as_flattened().to_vec();
+        camera_from_xyz = adapt_bradford(&light, &Illuminant::D65, &matrix).as_flattened().to_vec();
     }
     let (rows, _) = camera_from_xyz.as_chunks::<3>();
     let rows: [[f32; 3]; N] =

@@ -134,9 +134,7 @@ impl Table {
 
 /// The table with these knots of a channel at x, in [0, 1]; below 0 it is mirrored, unless it has knots there.
 pub(crate) fn table_at<T: Real>(knots: &[[T; 3]], x: T) -> T {
-    let value = |x| {
-        interpolate(knots, x).at_least(T::from_f64(0.0)).at_most(T::from_f64(1.0))
-    };
+    let value = |x| interpolate(knots, x).at_least(T::from_f64(0.0)).at_most(T::from_f64(1.0));
     if knots[0][0] < T::from_f64(0.0) { value(x) } else { mirrored(x, value) }
 }
 

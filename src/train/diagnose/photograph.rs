@@ -5,9 +5,7 @@ use super::sharpness;
 use super::target_noise::{TargetNoise, target_noise};
 use crate::photographs::image::{Image, Mask, linear_from_srgb};
 use crate::photographs::targets::SceneTone;
-use crate::photographs::tone::{
-    MeasuredPhotograph, ToneSettings, bounded, luminance, measurable,
-};
+use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, bounded, luminance, measurable};
 
 /// Blur is measured in the middle of the photograph, in at most this many pixels each way.
 const BLUR_SIDE: u32 = 640;

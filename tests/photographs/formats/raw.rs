@@ -8,9 +8,7 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use nightsplat::photographs::pseudo_gt::PseudoGt;
 use nightsplat::photographs::targets::SceneTone;
-use nightsplat::photographs::tone::{
-    InverseTone, MeasuredPhotograph, ToneCurve, ToneSettings,
-};
+use nightsplat::photographs::tone::{InverseTone, MeasuredPhotograph, ToneCurve, ToneSettings};
 
 use super::Folder;
 use crate::common::Random;
@@ -189,7 +187,9 @@ fn noise_at_black_keeps_its_mean_through_loading_and_the_target() {
             // Demosaicing repeats a sample up to four times, in both directions.
             let repeats = if is_mosaic { 4.0 } else { 1.0 };
             let error = 4.0 * repeats / (VIEWS as f64 * 256.0).sqrt();
-            println!("mosaic {is_mosaic}, signal {signal}: {loaded:.3?} {targets:.3?} {bright:.4?}");
+            println!(
+                "mosaic {is_mosaic}, signal {signal}: {loaded:.3?} {targets:.3?} {bright:.4?}"
+            );
             for found in loaded.into_iter().chain(targets) {
                 assert!((found - f64::from(signal)).abs() < error, "{signal}: {found}");
             }

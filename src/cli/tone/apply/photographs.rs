@@ -74,10 +74,7 @@ impl InputPhotograph {
 }
 
 /// The photographs of the input: a file, those of a folder by name, or those of a dataset.
-pub(super) fn listed(
-    args: &ApplyArgs,
-    config: &TrainConfig,
-) -> Result<Vec<InputPhotograph>> {
+pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<InputPhotograph>> {
     let input = &args.input;
     let unreadable =
         |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));
