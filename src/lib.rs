@@ -231,6 +231,7 @@ pub mod config {
     pub use crate::loss::{ParameterWeights, Weights};
     pub use crate::networks::{DenoiserSettings, NetworkVariant, Precision};
     pub use crate::photographs::dataset::{MeasuredSize, PixelOrientation};
+    pub use crate::photographs::image::StoredLight;
     pub use crate::photographs::tone::{GainChoice, White};
     pub use crate::splats::densify::DensityControl;
     pub use crate::splats::optimizer::{LearningRates, Schedule};

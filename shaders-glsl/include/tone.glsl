@@ -1,5 +1,5 @@
-// The tone curves: from an sRGB-encoded dark value to the pseudo-GT value in [0, 1]. The statistics in the parameters
-// are measured once per view; `tone::ToneCurve` is the host side.
+// The tone curves: from an sRGB-encoded dark value, at least 0, to the pseudo-GT value in [0, 1]. The statistics in the
+// parameters are measured once per view; `tone::ToneCurve` is the host side.
 
 #include "curves.glsl"
 
@@ -30,7 +30,9 @@ float toe(float value, ToneParameters tone) {
     float weight = tone.constants[3];
     if (!(weight > 0.0 && value < end)) return value;
     float s = (value - tone.offset) / (end - tone.offset);
-    return value + weight * (end * s * (0.25 + 0.75 * s) - value);
+    // The mirror of what is above the toe.
+    if (s <= -1.0) return value - 2.0 * weight * tone.offset;
+    return value + weight * (end * s * (0.25 + 0.75 * abs(s)) - value);
 }
 
 float tone_curve(float x, ToneParameters tone) {

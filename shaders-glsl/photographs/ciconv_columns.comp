@@ -6,9 +6,9 @@
 //! The colour invariant W of an image, its logarithm, and the partial moments that normalise it.
 //!
 //! Smoothing and differentiating the output of `ciconv_rows` along the columns gives E and the derivatives along x and
-//! y of E, E_l and E_ll; W = sum (d / (E + 1e-5))^2 over the six. One thread per pixel. A workgroup is one subgroup and
-//! writes the mean of its ln(W + 1e-5) and their sum of squares about that mean: nothing cancels, however far from 0
-//! they are. Lengyel et al. 2021. Reference: `src/reference/ciconv_columns.rs`.
+//! y of E, E_l and E_ll; W = sum (d / (max(E, 0) + 1e-5))^2 over the six. One thread per pixel. A workgroup is one
+//! subgroup and writes the mean of its ln(W + 1e-5) and their sum of squares about that mean: nothing cancels, however
+//! far from 0 they are. Lengyel et al. 2021. Reference: `src/reference/ciconv_columns.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -40,7 +40,8 @@ float log_invariant(uint i) {
         along_x += SMOOTH[abs(u)] * slope;
         along_y += sign(float(u)) * SLOPE[abs(u)] * smoothed;
     }
-    float scale = 1.0 / (color.x + EPSILON);
+    // Noise below black has no colour.
+    float scale = 1.0 / (max(color.x, 0.0) + EPSILON);
     along_x *= scale;
     along_y *= scale;
     return log(dot(along_x, along_x) + dot(along_y, along_y) + EPSILON);

@@ -15,7 +15,7 @@ layout(push_constant) uniform Params {
     uint height;  // pixels
 };
 
-layout(binding = 0) readonly  buffer Image  { float image[]; };  // (3, H, W), in [0, 1]
+layout(binding = 0) readonly  buffer Image  { float image[]; };  // (3, H, W)
 layout(binding = 1) writeonly buffer Smooth { vec3 smooth_rows[]; };  // (H, W, 3), E, E_l, E_ll
 layout(binding = 2) writeonly buffer Slope  { vec3 slope_rows[]; };   // (H, W, 3)
 

@@ -62,7 +62,8 @@ struct OfPhotographs;
 
 impl Selection for OfPhotographs {
     fn has(key: &str) -> bool {
-        ["downscale", "max_resolution", "white_balance", "orientation", "steps"].contains(&key)
+        ["downscale", "max_resolution", "light", "white_balance", "orientation", "steps"]
+            .contains(&key)
     }
 }
 

@@ -23,7 +23,7 @@ const COMMON: [(&str, &str); 8] = [
 const GROUPS: [(&str, &str); 6] = [
     (
         "Photographs",
-        "images exclude exclude-file orientation reference white-balance downscale max-resolution patch-pixels \
+        "images exclude exclude-file orientation reference light white-balance downscale max-resolution patch-pixels \
          test-every invert-masks undistort",
     ),
     (

@@ -10,6 +10,7 @@ use indicatif::ProgressBar;
 
 use super::{driver, finish, progress_bar, word};
 use crate::gpu::DeviceChoice;
+use crate::photographs::image::StoredLight;
 use crate::photographs::pose::{
     Mapper, Matcher, PoseOptions, PoseProgress, Posed, describe, estimate,
 };
@@ -59,6 +60,10 @@ pub struct PoseArgs {
     /// Let COLMAP use the GPU, which requires a display or CUDA
     #[arg(long)]
     pub colmap_gpu: bool,
+    /// How integer files store light: srgb, with levels as their formats say, or linear, as RAW converters and machine
+    /// vision write sensor values [default: srgb, and levels that the values show]
+    #[arg(long, value_name = "LIGHT")]
+    pub light: Option<StoredLight>,
     /// Replace a dataset that `pose` wrote
     #[arg(long)]
     pub overwrite: bool,
@@ -122,6 +127,7 @@ impl PoseArgs {
             camera_model: args.camera_model,
             colmap_gpu: args.colmap_gpu,
             fps: args.fps,
+            light: args.light,
             device: args.device.unwrap_or_default(),
             open: driver::open,
         }

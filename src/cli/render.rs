@@ -20,7 +20,7 @@ use crate::photographs::targets::SceneTone;
 use crate::results::colour_map;
 use crate::results::eval::RenderLayer;
 use crate::results::finished_run::FinishedRun;
-use crate::results::linear_light::{Clipped, STOPS, photograph_of};
+use crate::results::linear_light::{Clipped, STOPS, in_unit, photograph_of};
 use crate::results::video;
 use crate::results::view_exposures::ViewExposures;
 
@@ -314,7 +314,10 @@ pub fn run(args: &RenderArgs) -> Result<()> {
             let photograph = clipped.add(photograph_of(&image, &inverse));
             match format {
                 OutputFormat::Exr => {
-                    photograph.save_exr_with(&path, &[(STOPS, inverse.stops_to_target() as f32)])
+                    // In the unit of the photographs' files.
+                    let unit = view.or(dataset.views.first()).map_or(1.0, |view| view.unit);
+                    let stops = inverse.stops_to_target() as f32 - unit.log2();
+                    in_unit(photograph, unit).save_exr_with(&path, &[(STOPS, stops)])
                 }
                 _ => format.save(&photograph, &path),
             }

@@ -47,9 +47,9 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 
 use crate::camera::Lens;
-use crate::photographs::image::MaskFile;
 use crate::photographs::image::files::PhotographFiles;
-use crate::photographs::white_balance::WhiteBalanceGains;
+use crate::photographs::image::{Levels, MaskFile};
+use crate::photographs::white_balance::{WhiteBalance, WhiteBalanceGains};
 use crate::{Error, Result};
 pub(crate) use borders::Borders;
 pub use fingerprint::Fingerprint;
@@ -153,9 +153,13 @@ impl Dataset {
         let Listing { frames, mut skipped, remarks, clouds, has_split } =
             select(&layout, options, &files)?;
         log_split(&layout.root, has_split, options);
-        let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
-        let gains = white_balance_gains(&layout.root, &sources, options)?;
-        let views = pixels::load(sources, &layout, options, observer, gains, &mut skipped)?;
+        let mut sources = sources(&layout.root, &frames, options, &files, &mut skipped);
+        let headers = pixels::headers(&mut sources);
+        let mut levels = levels(&layout, &sources, options, &files)?;
+        let gains = white_balance_gains(&layout.root, &sources, options, levels)?;
+        let files = (sources, headers);
+        let views =
+            pixels::load(files, &layout, options, observer, &mut levels, gains, &mut skipped)?;
         if !views.iter().any(|view| view.split == Split::Train) {
             let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
             let problem = format!(
@@ -165,6 +169,7 @@ impl Dataset {
         }
         // After everything that may fail: an error is reported alone.
         warn(&remarks);
+        levels.say();
         let views = with_held_out(views, options.hold_out);
         let points = points(&layout, &views, &clouds)?;
         let points = match &layout.block {
@@ -269,16 +274,37 @@ impl Dataset {
     }
 }
 
+/// The levels of the training photographs; of a block, those of the whole dataset.
+fn levels(
+    layout: &DatasetLayout,
+    sources_of_views: &[ViewFiles],
+    options: &LoadOptions,
+    files: &PhotographFiles,
+) -> Result<Levels> {
+    let of = |sources: &[ViewFiles]| {
+        let training = sources.iter().filter(|source| source.split == Split::Train);
+        Levels::of_set(options.light, training.filter_map(ViewFiles::photograph))
+    };
+    if layout.block.is_none() {
+        return Ok(of(sources_of_views));
+    }
+    let whole = layout.whole();
+    let frames = select(&whole, options, files)?.frames;
+    Ok(of(&sources(&whole.root, &frames, options, files, &mut vec![])))
+}
+
 /// The gains of the photographs; `None` without a white balance.
 fn white_balance_gains(
     root: &Path,
     sources: &[ViewFiles],
     options: &LoadOptions,
+    levels: Levels,
 ) -> Result<Option<WhiteBalanceGains>> {
     let photographs = || {
         sources.iter().filter_map(|source| Some((source.name.as_str(), source.input.as_deref()?)))
     };
-    options.white_balance.as_ref().map(|balance| balance.gains(root, photographs())).transpose()
+    let gains = |balance: &WhiteBalance| balance.gains(root, photographs(), levels);
+    options.white_balance.as_ref().map(gains).transpose()
 }
 
 /// The files of each view. A training view without its photograph is left out, a test view is kept as a pose.

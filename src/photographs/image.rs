@@ -21,6 +21,8 @@ pub(crate) mod files;
 #[cfg(feature = "io")]
 mod jpeg;
 #[cfg(feature = "io")]
+mod levels;
+#[cfg(feature = "io")]
 mod mask;
 #[cfg(feature = "io")]
 mod orientation;
@@ -35,11 +37,15 @@ pub(crate) use codec::openings;
 pub(crate) use exif::lens_name;
 use rayon::prelude::*;
 #[cfg(feature = "io")]
-pub(crate) use {codec::PictureFile, colour::ColourCounts, mask::MaskFile};
+pub(crate) use {codec::PictureFile, colour::ColourCounts, levels::Levels, mask::MaskFile};
 #[cfg(feature = "io")]
-pub use {exif::exposure_value, jpeg::exif_segment, mask::Mask, orientation::Orientation};
+pub use {
+    exif::exposure_value, jpeg::exif_segment, levels::StoredLight, mask::Mask,
+    orientation::Orientation,
+};
 
-/// A colour image: planes of red, green and blue, sRGB-encoded, in [0, 1]; values from EXR files may exceed 1.
+/// A colour image: planes of red, green and blue, sRGB-encoded, in [0, 1]. Values of RAW and float files may exceed 1,
+/// and are negative where noise is below black; they are clamped when an image is shown or written with integers.
 ///
 /// The centre of the pixel in column `x` and row `y` is at `(x + 0.5, y + 0.5)`.
 #[derive(Clone, Debug, PartialEq)]
@@ -62,14 +68,20 @@ fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
 /// Middle grey in linear light: the mean of a photograph that is exposed by a light meter.
 pub const MIDDLE_GREY: f32 = 0.18;
 
-/// The sRGB encoding of a linear-light value; inverse of [`linear_from_srgb`].
+/// The sRGB encoding of a linear-light value; inverse of [`linear_from_srgb`]. It is odd: noise at black keeps its mean.
 pub fn srgb_from_linear(linear: f32) -> f32 {
-    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
+    let light = linear.abs();
+    let encoded =
+        if light <= 0.003_130_8 { 12.92 * light } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 };
+    encoded.copysign(linear)
 }
 
 /// The linear light of an sRGB-encoded value.
 pub fn linear_from_srgb(srgb: f32) -> f32 {
-    if srgb <= 0.040_45 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) }
+    let value = srgb.abs();
+    let linear =
+        if value <= 0.040_45 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) };
+    linear.copysign(srgb)
 }
 
 impl Image {
@@ -187,10 +199,12 @@ mod tests {
 
     #[test]
     fn the_transfer_functions_are_inverses_and_continuous_at_the_toe() {
-        for step in 0..=4000 {
+        for step in -4000..=4000 {
             let srgb = step as f32 / 1000.0;
+            assert_eq!(linear_from_srgb(-srgb), -linear_from_srgb(srgb));
             assert!(
-                (srgb_from_linear(linear_from_srgb(srgb)) - srgb).abs() < 2e-6 * srgb.max(1.0),
+                (srgb_from_linear(linear_from_srgb(srgb)) - srgb).abs()
+                    < 2e-6 * srgb.abs().max(1.0),
                 "{srgb}"
             );
         }

@@ -29,6 +29,7 @@ use crate::base::output::{check_writable, is_same_file};
 use crate::base::tree;
 use crate::camera::Lens;
 use crate::gpu::{DeviceChoice, Gpu};
+use crate::photographs::image::StoredLight;
 use crate::{Error, Result};
 
 /// The photographs, the dataset to write, and the programs to run.
@@ -60,6 +61,8 @@ pub struct PoseOptions {
     pub colmap_gpu: bool,
     /// Frames per second to take of a clip, above 0 and at most 240.
     pub fps: f64,
+    /// How integer files of the dark photographs store light.
+    pub light: Option<StoredLight>,
     /// Device that brightens the photographs.
     pub device: DeviceChoice,
     /// How it is opened.
@@ -120,7 +123,7 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(PoseProgress<'_>)) -> Res
     };
     let gpu = (options.open)(&options.device)?;
     let mut pictures = PosePhotographs { dark, bright, copies: out.work.join("tone-mapped") };
-    brighten(&gpu, &mut pictures, report)?;
+    brighten(&gpu, &mut pictures, options.light, report)?;
     let all = pictures.dark.len();
     let models = reconstruction.models(&pictures, report)?;
     let largest = Dataset::largest_model(&models, is_dark)?;
@@ -173,14 +176,15 @@ fn matcher(options: &PoseOptions, is_clip: bool) -> Result<Matcher> {
 fn brighten(
     gpu: &Gpu,
     pictures: &mut PosePhotographs,
+    light: Option<StoredLight>,
     report: &dyn Fn(PoseProgress<'_>),
 ) -> Result<()> {
     let PosePhotographs { dark, bright, copies } = pictures;
-    let gain = tone_mapped::write(gpu, dark, copies, report)?;
+    let gain = tone_mapped::write(gpu, dark, light, copies, report)?;
     let count = dark.len();
     report(PoseProgress::Line(&format!("{count} photographs brightened (gain {gain:.1})")));
     if !bright.is_empty() {
-        let gain = tone_mapped::write(gpu, bright, &copies.join(BRIGHT), report)?;
+        let gain = tone_mapped::write(gpu, bright, None, &copies.join(BRIGHT), report)?;
         let count = bright.len();
         report(PoseProgress::Line(&format!(
             "{count} bright photographs beside them (gain {gain:.1})"

@@ -11,7 +11,7 @@
 //! auto    delta + (1 - delta) [(1 - lambda) s(x) + lambda x s(Y) / Y]    s(x) = 1 - exp(-k x), delta = 0.075
 //! ```
 //!
-//! clamped to [0, 1], where t = x / p90, Y is the mean luminance, and the black level delta0 = alpha (1 - p10 /
+//! clamped to [0, 1] for x from 0 on, and T(-x) = 2 T(0) - T(x) below 0, where t = x / p90, Y is the mean luminance, and the black level delta0 = alpha (1 - p10 /
 //! p90)^beta is high if shadows are crushed. The statistics are those of one photograph, or means over a scene
 //! ([`Statistics`]). In the automatic curve, Y is the pixel's luminance, and the gain k follows from the luminance of
 //! all photographs ([`Exposure`]); the gain of every other curve can, too. [`FAMILIES`] is the table of all curves; a
@@ -46,7 +46,7 @@ mod table;
 #[cfg(feature = "cli")]
 pub(crate) use self::curve::{Curve, Variable};
 #[cfg(feature = "io")]
-pub(crate) use self::curve::{clamped, curve_at, tone_curve};
+pub(crate) use self::curve::{bounded, clamped, curve_at, mirrored, tone_curve};
 #[cfg(feature = "io")]
 pub(crate) use self::exposure::all_black;
 #[cfg(feature = "io")]
@@ -83,7 +83,7 @@ pub(crate) use self::statistics::{luminance, measurable};
 #[cfg(feature = "io")]
 pub use self::table::Table;
 #[cfg(feature = "check")]
-pub(crate) use self::table::interpolate;
+pub(crate) use self::table::table_at;
 pub use crate::kernels::ToneParameters;
 use crate::kernels::curves::{CURVE_AUTO, CURVE_PROFILE, CURVE_TABLE};
 use crate::{Error, Result};

@@ -15,7 +15,7 @@ use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::image::{Image, linear_from_srgb, srgb_from_linear};
+use super::image::{ColourCounts, Image, Levels, linear_from_srgb, srgb_from_linear};
 use crate::{Error, Result};
 
 /// The source of the white balance.
@@ -49,11 +49,12 @@ impl WhiteBalance {
     pub(crate) const FORM: &'static str = "R,G,B of 0.001 to 1000, a colour temperature of 2000 to 25000 (kelvin), \
         VIEW,x,y,w,h of a neutral area in whole pixels, or VIEW,x1,y1,..,x4,y4, the corners of a colour chart";
 
-    /// The gains, measured in one of the named photographs of `root` if necessary.
+    /// The gains, measured in one of the named photographs of `root`, of these levels, if necessary.
     pub(crate) fn gains<'a>(
         &self,
         root: &Path,
         photographs: impl IntoIterator<Item = (&'a str, &'a Path)>,
+        levels: Levels,
     ) -> Result<WhiteBalanceGains> {
         let view = match self {
             Self::Gains(gains) => return Ok(WhiteBalanceGains(gains.map(|gain| gain as f32))),
@@ -69,7 +70,8 @@ impl WhiteBalance {
             );
             Error::input(root, problem)
         })?;
-        let gains = neutralising(self.mean_of(&Image::load(path)?)?);
+        let photograph = Image::load_counted(path, &ColourCounts::of_levels(levels))?;
+        let gains = neutralising(self.mean_of(&photograph)?);
         let [red, green, blue] = gains.0;
         tracing::info!(
             "white balance from view {view}: gains {red:.3}, {green:.3}, {blue:.3} in linear light"
@@ -96,8 +98,7 @@ impl WhiteBalance {
         let mut count = 0.0;
         for patch in &pixels {
             let colours = patch.iter().map(|&[x, y]| image.pixel(x, y));
-            let usable =
-                |colour: &[f32; 3]| colour.iter().all(|value| (0.0..CLIPPED).contains(value));
+            let usable = |colour: &[f32; 3]| colour.iter().all(|value| *value < CLIPPED);
             let colours: Vec<[f32; 3]> = colours.filter(usable).collect();
             // The rest of a partly clipped patch would be biased to its dark pixels.
             if 2 * colours.len() < patch.len() {
@@ -303,7 +304,7 @@ mod tests {
     fn gains(text: &str, image: &Image) -> Result<[f32; 3]> {
         let (path, _folder) = saved(image);
         let balance: WhiteBalance = text.parse().unwrap();
-        Ok(balance.gains(Path::new("photos"), [("v1", path.as_path())])?.0)
+        Ok(balance.gains(Path::new("photos"), [("v1", path.as_path())], Levels::default())?.0)
     }
 
     /// Ratio of the largest to the smallest channel of a pixel in linear light.
@@ -348,7 +349,9 @@ mod tests {
 
     #[test]
     fn gains_neutralise_the_light_of_a_temperature() {
-        let of = |kelvin: f64| WhiteBalance::Kelvin(kelvin).gains(Path::new(""), []).unwrap().0;
+        let of = |kelvin: f64| {
+            WhiteBalance::Kelvin(kelvin).gains(Path::new(""), [], Levels::default()).unwrap().0
+        };
         assert!(of(6504.0).iter().all(|gain| (gain - 1.0).abs() < 1e-3), "{:?}", of(6504.0));
         // Illuminant A, 2856 K: x = 0.44757, y = 0.40745, relative to D65.
         let [red, green, blue] = of(2856.0);

@@ -20,7 +20,8 @@ fn log_invariants(params: &Params, smooth_rows: &[Vec3], slope_rows: &[Vec3]) ->
             };
             Rounded::sum(13.0, inside.map(term))
         };
-        let e = along(smooth_rows, 0, &smooth) + Rounded::from_f64(EPSILON);
+        let e = along(smooth_rows, 0, &smooth).at_least(Rounded::from_f64(0.0));
+        let e = e + Rounded::from_f64(EPSILON);
         let squares = (0..3).map(|channel| {
             let x = along(slope_rows, channel, &smooth) / e;
             let y = along(smooth_rows, channel, &slope) / e;

@@ -36,7 +36,7 @@ impl Reference for Kernel {
         let (inverse, count) = (inverse(params, constants), params.pixel_count as usize);
         for at in 0..count {
             let Some((color, alpha)) = pixel(params, &slices, at) else { continue };
-            for (c, x) in inverse.invert(color).rgb.into_iter().enumerate() {
+            for (c, x) in inverse.invert(inverse.shown(color)).rgb.into_iter().enumerate() {
                 slices.render[c * count + at] = (x * alpha) as f32;
             }
         }
@@ -50,10 +50,12 @@ impl Reference for Kernel {
         for at in 0..count {
             let Some((color, alpha)) = pixel(params, &slices, at) else { continue };
             // Beyond the largest value that is inverted, the solution is that of this value.
-            let color = inverse.bounded(color);
+            let color = inverse.bounded(inverse.shown(color));
             let found = inverse.invert(color).rgb;
             let off = [0, 1, 2].map(|c| residual(params, constants, found[c], color[c]));
-            let moved = |sign: f64| inverse.invert([0, 1, 2].map(|c| color[c] + sign * off[c])).rgb;
+            let moved = |sign: f64| {
+                inverse.invert(inverse.shown([0, 1, 2].map(|c| color[c] + sign * off[c]))).rgb
+            };
             let (low, high) = (moved(-1.0), moved(1.0));
             for c in 0..3 {
                 let bound = 2.0 * (found[c] - low[c]).max(high[c] - found[c]);

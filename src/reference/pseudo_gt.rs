@@ -5,7 +5,10 @@ use crate::kernels::curves::{
     CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_PROFILE, CURVE_TABLE,
 };
 use crate::kernels::pseudo_gt::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::{Real, interpolate, measurable, profiled, shoulder, toe};
+use crate::photographs::tone::{Real, bounded, profiled, shoulder, table_at, toe};
+
+/// The largest value that a curve of several channels takes.
+const LARGEST: f32 = 65504.0;
 
 /// The stored code of a value.
 fn stored(code_bits: u32, slices: &Slices<'_>, i: usize) -> f32 {
@@ -20,30 +23,31 @@ fn stored(code_bits: u32, slices: &Slices<'_>, i: usize) -> f32 {
 
 /// The curves whose channels depend on more than their own value.
 fn mixed(curve: u32, rgb: [f32; 3], tone: &ToneParameters) -> [Rounded; 3] {
-    let rgb = rgb.map(|x| Rounded::exact(measurable(x)));
+    let rgb = rgb.map(|x| Rounded::exact(bounded(x, LARGEST)));
     let [white, offset, gain] = [tone.white, tone.offset, tone.gain].map(Rounded::exact);
     let (one, of) = (Rounded::from_f64(1.0), Rounded::from_f64);
-    let y = of(0.299) * rgb[0] + of(0.587) * rgb[1] + of(0.114) * rgb[2];
+    let y = (of(0.299) * rgb[0] + of(0.587) * rgb[1] + of(0.114) * rgb[2]).abs();
     let channel = |channel: usize| match curve {
         CURVE_AUTO => {
             let (t, y) = (rgb[channel] / white, (y / white).at_least(of(1e-20)));
             let [share, bend, end, weight] =
                 [0, 1, 2, 3].map(|at| Rounded::exact(tone.constants[at]));
             let kept = t * (shoulder(y, bend) / y);
-            let soft = (one - share) * shoulder(t, bend) + share * kept;
+            let size = shoulder(t.abs(), bend);
+            let size = if t.value < 0.0 { -size } else { size };
+            let soft = (one - share) * size + share * kept;
             toe(offset + (one - offset) * soft, offset, [end, weight])
         }
         CURVE_LUM_PRESERVE => rgb[channel] * (y * gain / (y + of(1e-6))),
         _ => rgb[channel] * (one / Rounded::exact(tone.constants[channel])),
     };
-    [0, 1, 2].map(channel).map(|mixed| mixed.at_least(of(0.0)).at_most(one))
+    [0, 1, 2].map(channel).map(|mixed| mixed.at_least(-one).at_most(one))
 }
 
 /// A value on its channel's knots, three numbers each.
 fn tabled(knots: &[Rounded], count: usize, channel: usize, x: Rounded) -> Rounded {
     let (knots, _) = knots.as_chunks::<3>();
-    let y = interpolate(&knots[channel * count..][..count], x);
-    y.at_least(Rounded::from_f64(0.0)).at_most(Rounded::from_f64(1.0))
+    table_at(&knots[channel * count..][..count], x)
 }
 
 /// A pixel under the whole curve.
@@ -62,7 +66,9 @@ fn mapped(
             let x = Rounded::exact(rgb[channel]) / white;
             tabled(numbers, params.knot_count as usize, channel, x)
         }),
-        CURVE_PROFILE => profiled(rgb.map(|x| Rounded::exact(measurable(x)) / white), numbers),
+        CURVE_PROFILE => {
+            profiled(rgb.map(|x| Rounded::exact(bounded(x, LARGEST)) / white), numbers)
+        }
         curve => rgb.map(|x| rounded_tone_curve(curve, x, tone)),
     }
 }
@@ -76,7 +82,7 @@ fn targets(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<R
         let rgb = [0, 1, 2].map(|c| stored(constants.code_bits, slices, c * n + i));
         let curved = mapped((params, constants), rgb, &tone, &numbers);
         [0, 1, 2].map(|channel| {
-            let plain = Rounded::exact(measurable(rgb[channel]).min(1.0));
+            let plain = Rounded::exact(bounded(rgb[channel], 1.0));
             let weight = Rounded::exact(tone.weight);
             let part = plain + weight * (curved[channel] - plain);
             if tone.weight < 1.0 { part } else { curved[channel] }

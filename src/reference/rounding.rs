@@ -8,7 +8,7 @@ use bytemuck::Pod;
 
 use crate::gpu::Tolerance;
 use crate::kernels::ToneParameters;
-use crate::photographs::tone::{Real, curve_at};
+use crate::photographs::tone::{Real, curve_at, mirrored};
 
 /// The relative error of one rounding; half a unit in the last place (ulp).
 pub const UNIT: f64 = f32::EPSILON as f64 / 2.0;
@@ -114,11 +114,14 @@ impl Rounded {
     }
 }
 
-/// The pseudo-GT value in [0, 1] of the sRGB-encoded value `x` under the curve `curve` (a `CURVE_*`).
+/// The pseudo-GT value of the sRGB-encoded value `x` under the curve `curve` (a `CURVE_*`).
 pub(super) fn rounded_tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> Rounded {
     let [x, white, offset, gain] = [x, tone.white, tone.offset, tone.gain].map(Rounded::exact);
-    let y = curve_at(curve, x / white, [offset, gain], &tone.constants.map(Rounded::exact));
-    y.at_least(Rounded::from_f64(0.0)).at_most(Rounded::from_f64(1.0))
+    let constants = tone.constants.map(Rounded::exact);
+    mirrored(x, |x| {
+        let y = curve_at(curve, x / white, [offset, gain], &constants);
+        y.at_least(Rounded::from_f64(0.0)).at_most(Rounded::from_f64(1.0))
+    })
 }
 
 /// Writes the values to the start of a buffer of floats or of groups of floats.

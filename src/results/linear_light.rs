@@ -3,7 +3,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::photographs::image::{Image, linear_from_srgb};
+use crate::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use crate::photographs::tone::{InverseTone, Inverted};
 use crate::splats::harmonics::{quadrature, sh_basis};
 use crate::splats::scene::{Gaussians, rest_coefficients};
@@ -23,6 +23,15 @@ pub(crate) fn photograph_of(target: &Image, inverse: &InverseTone) -> (Image, us
     let plane = |plane: usize| inverted.iter().map(move |pixel| pixel.rgb[plane] as f32);
     let data = (0..3).flat_map(plane).collect();
     (Image { data, ..*target }, inverted.iter().filter(|pixel| pixel.is_clipped).count())
+}
+
+/// An image whose linear light is multiplied by `unit`.
+pub(crate) fn in_unit(mut image: Image, unit: f32) -> Image {
+    if unit != 1.0 {
+        let scale = |x: &mut f32| *x = srgb_from_linear(unit * linear_from_srgb(*x));
+        image.data.par_iter_mut().for_each(scale);
+    }
+    image
 }
 
 /// The target of a photograph under this curve.
@@ -76,7 +85,8 @@ pub(crate) fn linear_gaussians(
         for (basis, weight) in &directions {
             let color: DVec3 =
                 coefficients.iter().zip(basis).map(|(value, basis)| *value * *basis).sum();
-            let found = inverse.invert((color + 0.5).max(DVec3::ZERO).to_array());
+            // Renderers cut colours at black.
+            let found = inverse.invert(inverse.shown((color + 0.5).to_array()));
             is_clipped |= found.is_clipped;
             let light = found.rgb.map(|x| raised * f64::from(linear_from_srgb(x as f32)));
             for (sum, basis) in fitted.iter_mut().zip(basis) {
@@ -134,7 +144,6 @@ impl Clipped {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::photographs::image::srgb_from_linear;
     use crate::photographs::metrics::psnr_of_counted;
     use crate::photographs::targets::SceneTone;
     use crate::photographs::tone::{MeasuredPhotograph, Tone, ToneSettings};

@@ -25,6 +25,7 @@ use crate::networks::NetworkVariant;
 use crate::photographs::dataset::{
     DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize, PixelOrientation,
 };
+use crate::photographs::image::StoredLight;
 use crate::photographs::tone::ToneSettings;
 use crate::photographs::white_balance::WhiteBalance;
 use crate::splats::attributes::Attribute;
@@ -95,6 +96,12 @@ pub struct TrainConfig {
     invert_masks: bool = false => Rule::Flag, "--invert-masks";
     /// Mask black borders and corners that the photographs have in the same place, as undistorting leaves them.
     mask_borders: bool = true => Rule::Flag;
+    /// How the integer files of the photographs store light: srgb, as their formats say, or linear, as RAW converters and
+    /// machine vision write sensor values; with srgb, levels are those of the format. Without either, files count as
+    /// sRGB, with the levels that all of them together show: 10, 12 or 14 of 16 bits, the range of video, or a narrow
+    /// range, and in float files a unit of their own.
+    light: Option<StoredLight> = None, "srgb, and levels that the values show"
+        => Rule::OneOf(&StoredLight::NAMES), "--light LIGHT";
     /// White balance of the photographs before they are measured: gains R,G,B of linear light; the colour temperature
     /// of the light in kelvin; VIEW,x,y,w,h, a neutral area of one photograph in pixels as stored; or
     /// VIEW,x1,y1,..,x4,y4, the corners of a chart of 24 patches: at the dark skin, bluish green, black and white
@@ -309,6 +316,7 @@ impl TrainConfig {
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
             mask_borders: self.mask_borders,
+            light: self.light,
             white_balance: self.white_balance.clone(),
             undistort: self.undistort,
             measured: match &self.tone {

@@ -24,8 +24,10 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::camera::Camera;
-use crate::photographs::dataset::{self, Borders, Dataset, LoadOptions, View};
-use crate::photographs::image::{ColourCounts, Image, MIDDLE_GREY, Mask, PictureFile, files};
+use crate::photographs::dataset::{self, Borders, Dataset, LoadOptions, Split, View};
+use crate::photographs::image::{
+    ColourCounts, Image, Levels, MIDDLE_GREY, Mask, PictureFile, files,
+};
 use crate::photographs::targets::SceneTone;
 use crate::photographs::tone::{Exposure, MeasuredPhotograph, ToneSettings, is_black};
 use crate::photographs::white_balance::WhiteBalanceGains;
@@ -204,7 +206,7 @@ impl Diagnosis {
         let scene = SceneTone::from_photographs(&ToneSettings::default(), &measured);
         let Some(exposure) = scene.and_then(|scene| scene.exposure) else {
             let problem = "every training photograph is almost black (99 % of its pixels are below 2 of 255); \
-                           expose longer";
+                           expose longer, or say `--light linear` if 16-bit files hold linear light";
             return Err(Error::input(&dataset.root, problem));
         };
         let of_view = |(index, photograph): (usize, &PhotographStatistics)| {
@@ -252,10 +254,13 @@ fn read(
         Image::size_of(&file.input).map(|(w, h)| u64::from(w) * u64::from(h))
     };
     let largest = files.iter().filter_map(|file| area(file).ok()).max().unwrap_or_default();
-    let colours = ColourCounts::default();
+    let training = all.iter().filter(|file| file.split == Split::Train && !files.is_empty());
+    let training: Vec<&Path> = training.map(|file| file.input.as_path()).collect();
+    let levels = Levels::of_all(options.light, &training);
+    let colours = ColourCounts::of_levels(levels);
     let named = || all.iter().map(|file| (file.name.as_str(), file.input.as_path()));
     let balance = options.white_balance.as_ref().filter(|_| !files.is_empty());
-    let gains = balance.map(|balance| balance.gains(root, named())).transpose()?;
+    let gains = balance.map(|balance| balance.gains(root, named(), levels)).transpose()?;
     let borders = match options.mask_borders && !files.is_empty() {
         true => Borders::of_photographs(all),
         false => Borders::default(),

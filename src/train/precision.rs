@@ -199,6 +199,8 @@ mod tests {
             let (back, kept) = kept(PhotographBits::Exact, &values);
             assert_eq!((bits(&back), kept), (bits(&values), expected), "{different} different");
         }
+        let signed: Vec<f32> = photograph(60_003, 251).iter().map(|value| value - 0.1).collect();
+        assert_eq!(kept(PhotographBits::Exact, &signed), (signed, 8));
         let values = photograph(60_003, 251);
         let (back, kept) = kept(PhotographBits::Single, &values);
         assert_eq!((bits(&back), kept), (bits(&values), 32));
@@ -215,8 +217,11 @@ mod tests {
             assert_eq!(kept, expected);
             let worst = back.iter().zip(&values).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(worst < 0.51 * step && worst > 0.49 * step, "{worst} of {step}");
-            let beyond = [&values[..], &[1.5; 3]].concat();
-            assert_eq!(self::kept(asked, &beyond), (beyond, 32));
+            // Noise at black is negative.
+            for other in [1.5, -1e-3] {
+                let beyond = [&values[..], &[other; 3]].concat();
+                assert_eq!(self::kept(asked, &beyond), (beyond, 32));
+            }
         }
         // An 8-bit photograph is on the grid, and 16 bits represent what 8 cannot.
         let codes = photograph(60_005, 200)[5..].to_vec();

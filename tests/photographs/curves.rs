@@ -257,6 +257,10 @@ fn curves_that_mix_channels_match_their_reference() {
         let mut image = photograph(pixels);
         image[0] = f32::NAN;
         image[pixels - 1] = 0.0;
+        // Below black, in one channel and in all.
+        for (at, value) in image[1..].iter_mut().enumerate().filter(|(at, _)| at % 5 == 0) {
+            *value *= if at % 3 == 0 { -1.0 } else { -0.01 };
+        }
         let constants = [0.2, 0.3, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0];
         let plain = ToneParameters { white: 1.0, offset: 0.0, gain: 3.0, weight: 1.0, constants };
         let automatic = ToneParameters { white: 0.07, offset: 0.075, gain: 1.0, ..plain };
@@ -271,6 +275,51 @@ fn curves_that_mix_channels_match_their_reference() {
             ),
         ] {
             mapped(curve, &image, tone, (&[], 0));
+        }
+    }
+}
+
+/// With its slope at black, where the photographs' noise is on both sides.
+#[test]
+fn every_curve_goes_on_below_black_as_its_mirror_image() {
+    let above = [1e-6_f32, 1e-3, 0.01, 0.05, 0.3, 0.9];
+    let grid = [&above.map(|x| -x)[..], &[0.0], &above].concat();
+    for family in FAMILIES.iter().filter(|family| family.white != White::ChannelMeans) {
+        let mut tone = ToneParameters { white: 0.4, offset: 0.1, gain: 0.8, ..Default::default() };
+        (tone.weight, tone.constants[0]) = (1.0, 0.0);
+        for (padded, constant) in tone.constants.iter_mut().zip(family.defaults()) {
+            *padded = constant as f32;
+        }
+        for found in on_device(family.curve, &grid, tone) {
+            for (at, _) in above.iter().enumerate() {
+                let mirrored = 2.0 * found[6] - found[7 + at];
+                assert!((found[at] - mirrored).abs() < 1e-6, "{}: {found:?}", family.name);
+            }
+        }
+    }
+    let colours = photograph(100);
+    let below: Vec<f32> = colours.iter().map(|x| -x).collect();
+    let (table, profile) = (table(), crate::common::setup::profile());
+    let knots: Vec<f32> = table.knots().iter().flat_map(|knot| knot.to_array()).collect();
+    for (curve, numbers, count) in [
+        (CURVE_AUTO, vec![], 0),
+        (CURVE_LUM_PRESERVE, vec![], 0),
+        (CURVE_PER_CHANNEL, vec![], 0),
+        (CURVE_TABLE, knots, 6),
+        (CURVE_PROFILE, profile.rows(), 0),
+    ] {
+        let constants = [0.3, 1.5, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+        for weight in [1.0, 0.6] {
+            let tone = ToneParameters { white: 1.5, offset: 0.07, gain: 0.9, weight, constants };
+            let of = |image: &[f32]| mapped(curve, image, tone, (&numbers, count));
+            let (lit, dark, black) = (of(&colours), of(&below), of(&[0.0; 300]));
+            for i in 0..colours.len() {
+                let mirrored = 2.0 * black[i] - lit[i];
+                // A profile goes on with the slope of its first segment.
+                let is_near = curve != CURVE_PROFILE || colours[i] == 0.0;
+                assert!(!is_near || (dark[i] - mirrored).abs() < 1e-6, "curve {curve}, {i}");
+                assert!(dark[i] <= black[i] || curve == CURVE_TABLE, "curve {curve}, {i}");
+            }
         }
     }
 }
@@ -361,8 +410,8 @@ fn a_profile_on_the_device_matches_its_reference_and_double_precision() {
         let found = mapped(CURVE_PROFILE, &photograph, tone, (&made.rows(), 0));
         for (i, found) in found.into_iter().enumerate() {
             let t = [0, 1, 2].map(|channel| match photograph[channel * pixels + i % pixels] {
-                x if x > 0.0 => f64::from(x.min(65504.0)) / f64::from(white),
-                _ => 0.0,
+                x if x.is_nan() => 0.0,
+                x => f64::from(x.clamp(-65504.0, 65504.0)) / f64::from(white),
             });
             let exact = made.value(t)[i / pixels];
             assert!((f64::from(found) - exact).abs() <= 3e-6, "{i}: {found}, not {exact}");

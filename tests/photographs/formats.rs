@@ -5,6 +5,7 @@ mod bad_input;
 mod colours;
 mod keys;
 mod layouts;
+mod levels;
 mod models;
 mod photographs;
 #[cfg(unix)]

@@ -206,8 +206,22 @@ mod command {
         let (width, height) = (Some(16), Some(16));
         let (views, seed) = (Some(SMALL.views), SMALL.seed);
         let dir = dir.to_owned();
-        let (street, fisheye, lamp) = (None, false, None);
-        SynthArgs { dir, street, views, width, height, seed, fisheye, lamp, overwrite }
+        let (street, fisheye, lamp, brackets) = (None, false, None, None);
+        let (night, faults) = Default::default();
+        SynthArgs {
+            dir,
+            street,
+            views,
+            width,
+            height,
+            seed,
+            fisheye,
+            lamp,
+            night,
+            faults,
+            brackets,
+            overwrite,
+        }
     }
 
     #[test]

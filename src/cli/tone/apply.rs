@@ -71,7 +71,7 @@ impl Selection for OfTargets {
     fn has(key: &str) -> bool {
         let of_tone = ["brightness", "colour", "theta", "scene_statistics"];
         key.strip_prefix("tone.").is_some_and(|name| of_tone.contains(&name))
-            || ["white_balance", "invert_masks"].contains(&key)
+            || ["light", "white_balance", "invert_masks"].contains(&key)
     }
 }
 
@@ -242,7 +242,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     let config = args.config(None)?;
     let settings = config.tone.clone();
     args.out.iter().chain(&args.report).try_for_each(|path| check_writable(path))?;
-    let photographs = listed(args, config.white_balance.as_ref())?;
+    let photographs = listed(args, &config)?;
     args.out.iter().try_for_each(|out| create_folder(out))?;
     let gpu = driver::open(&args.device.clone().unwrap_or_default())?;
     let mut set =
@@ -275,7 +275,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
         progress.inc(1);
     }
     progress.finish_and_clear();
-    set.colours.log();
+    set.colours.iter().for_each(ColourCounts::log);
     let exposure = set.targets.scene.exposure;
     let Some(mut scene) = scene(&views) else {
         let nothing = || Error::input(&args.input, "contains no photograph");
@@ -296,8 +296,8 @@ struct CurveOnSet {
     targets: Targets,
     /// Masks hide white.
     inverted: bool,
-    /// Counts of converted and unsupported colours.
-    colours: ColourCounts,
+    /// Counts of converted and unsupported colours, of photographs and of references.
+    colours: [ColourCounts; 2],
 }
 
 impl CurveOnSet {
@@ -308,11 +308,12 @@ impl CurveOnSet {
         photographs: &[InputPhotograph],
         (input, inverted): (&Path, bool),
     ) -> Result<Self> {
+        let levels = photographs.first().map(|listed| listed.levels).unwrap_or_default();
         let mut measured = vec![];
         if settings.scene_statistics || settings.takes_exposure() {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
                 // Unusable photographs are reported when they are mapped.
-                let unsaid = ColourCounts::default();
+                let unsaid = ColourCounts::of_levels(levels);
                 let Ok((photograph, gaps)) = loaded(listed, inverted, &unsaid) else { continue };
                 measured.push(MeasuredPhotograph::measure(&without(&photograph, &gaps)));
             }
@@ -330,7 +331,7 @@ impl CurveOnSet {
         Ok(Self {
             targets: Targets::in_scene(gpu, scene)?,
             inverted,
-            colours: ColourCounts::default(),
+            colours: [ColourCounts::of_levels(levels), ColourCounts::new("reference image")],
         })
     }
 
@@ -371,9 +372,9 @@ struct Mapped {
 }
 
 fn mapped(set: &mut CurveOnSet, listed: &InputPhotograph) -> Result<Mapped> {
-    let (photograph, gaps) = loaded(listed, set.inverted, &set.colours)?;
+    let (photograph, gaps) = loaded(listed, set.inverted, &set.colours[0])?;
     let load = |path: &PathBuf| {
-        let image = Image::load_counted(path, &set.colours)?;
+        let image = Image::load_counted(path, &set.colours[1])?;
         let is_plain = listed.split.is_none();
         Ok(if is_plain { image.turned(Orientation::from_file(path)) } else { image })
     };

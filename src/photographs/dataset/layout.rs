@@ -35,6 +35,11 @@ const MODEL_FOLDERS: [&str; 8] = [
 const MOST_ABOVE: usize = 3;
 
 impl DatasetLayout {
+    /// The layout of the whole dataset, without a block.
+    pub(super) fn whole(&self) -> Self {
+        Self { block: None, ..self.clone() }
+    }
+
     /// The layout of a path that a user gives: a dataset's folder or archive, its transforms file, its COLMAP model, or
     /// a block of it.
     pub(super) fn detect(given: &Path) -> Result<Self> {

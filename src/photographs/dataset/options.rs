@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use super::PixelOrientation;
 use crate::base::settings::Rule;
 use crate::base::tree;
+use crate::photographs::image::StoredLight;
 use crate::photographs::white_balance::WhiteBalance;
 use crate::{Error, Result};
 
@@ -42,6 +43,8 @@ pub struct LoadOptions {
     pub invert_masks: bool,
     /// Mask black borders that photographs have in the same place, as undistorting leaves them.
     pub mask_borders: bool,
+    /// How integer files of the photographs store light; `None`: as sRGB, with the levels that their values show.
+    pub light: Option<StoredLight>,
     /// Gains of the channels of the photographs; reference images are unchanged.
     pub white_balance: Option<WhiteBalance>,
     /// The size at which training photographs are measured while they are decoded, if they are not kept at that size.
@@ -91,6 +94,7 @@ impl Default for LoadOptions {
             hold_out: 0,
             invert_masks: false,
             mask_borders: true,
+            light: None,
             white_balance: None,
             measured: MeasuredSize::default(),
             undistort: false,

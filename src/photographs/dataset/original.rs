@@ -12,7 +12,7 @@ use super::turns::Turns;
 use crate::Result;
 use crate::base::hash::Hasher;
 use crate::camera::Lens;
-use crate::photographs::image::{Image, Orientation, PictureFile};
+use crate::photographs::image::{ColourCounts, Image, Levels, Orientation, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
 use crate::photographs::white_balance::WhiteBalanceGains;
 
@@ -26,6 +26,8 @@ pub struct Original {
     undistort: bool,
     /// The rotation from the stored pixels to those of the camera.
     orientation: Orientation,
+    /// Levels of a photograph's file.
+    pub(super) levels: Levels,
     /// White balance of a photograph.
     pub(super) gains: Option<WhiteBalanceGains>,
     /// The statistics of the photograph, and the size they were measured at.
@@ -43,6 +45,7 @@ impl Original {
             lens,
             undistort,
             orientation: turns.loading,
+            levels: Levels::default(),
             gains: None,
             measured: None,
             checksum: None,
@@ -73,7 +76,8 @@ impl Original {
     pub(super) fn load_at(&self, size: (u32, u32)) -> Result<Image> {
         let Self { path, lens, undistort, .. } = self;
         let preparation = Preparation::new(lens, *undistort, size, &path.to_string_lossy())?;
-        let (mut image, _) = PictureFile::open(path)?.decode()?;
+        let colours = ColourCounts::of_levels(self.levels);
+        let (mut image, _) = PictureFile::open(path)?.decode_counted(&colours)?;
         if let Some(gains) = self.gains {
             gains.apply(&mut image);
         }

@@ -23,7 +23,7 @@ use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
 use crate::camera::{Camera, Lens};
-use crate::photographs::image::{ColourCounts, Image, Mask, PictureFile};
+use crate::photographs::image::{ColourCounts, Image, Levels, Mask, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
@@ -37,18 +37,57 @@ const BYTES_PER_PIXEL: u64 = 12;
 /// Sees a training photograph as it is stored, with its mask, while it is decoded; from any thread.
 pub(crate) type PhotographObserver<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>) + Sync);
 
-/// The views in order of name. Files that cannot be decoded are named in `skipped`.
+/// The headers of photograph and reference image of each view.
+type Headers = Vec<[Option<ImageHeader>; 2]>;
+
+/// Reads the files while memory allows.
+pub(super) fn headers(sources: &mut [ViewFiles]) -> Headers {
+    let memory = Allowance::new(MAX_READ);
+    sources.par_iter_mut().map(|source| source.headers(&memory)).collect()
+}
+
+/// The views in order of name. Files that cannot be decoded are named in `skipped`. Levels that a photograph exceeds
+/// become those of its format, and all are decoded again.
 pub(super) fn load(
-    mut sources: Vec<ViewFiles>,
+    (sources, headers): (Vec<ViewFiles>, Headers),
     layout: &DatasetLayout,
     options: &LoadOptions,
     observer: Option<PhotographObserver<'_>>,
+    levels: &mut Levels,
     gains: Option<WhiteBalanceGains>,
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
-    let memory = Allowance::new(MAX_READ);
-    let headers: Vec<[Option<ImageHeader>; 2]> =
-        sources.par_iter_mut().map(|source| source.headers(&memory)).collect();
+    let others = skipped.len();
+    if levels.are_limits() {
+        let views = load_with(
+            (sources.clone(), headers.clone()),
+            layout,
+            options,
+            observer,
+            *levels,
+            gains,
+            skipped,
+        )?;
+        if let Some(views) = views {
+            return Ok(views);
+        }
+        skipped.truncate(others);
+        *levels = Levels::as_stored(options.light);
+    }
+    let views = load_with((sources, headers), layout, options, observer, *levels, gains, skipped)?;
+    Ok(views.unwrap_or_default())
+}
+
+/// The views at these levels; `None` if a photograph exceeds them.
+fn load_with(
+    (sources, headers): (Vec<ViewFiles>, Headers),
+    layout: &DatasetLayout,
+    options: &LoadOptions,
+    observer: Option<PhotographObserver<'_>>,
+    levels: Levels,
+    gains: Option<WhiteBalanceGains>,
+    skipped: &mut Vec<String>,
+) -> Result<Option<Vec<View>>> {
     let of_photographs: Vec<Option<ImageHeader>> =
         headers.iter().map(|[photograph, _]| *photograph).collect();
     let points = || points::of_sources(layout, &sources);
@@ -75,7 +114,7 @@ pub(super) fn load(
     let largest = groups.iter().map(|(lens, _)| pixel_count((lens.width, lens.height))).max();
     let at_once = Image::decoded_at_once(largest.unwrap_or_default());
     let originals = Allowance::new(bytes_for_originals(&groups, options));
-    let colours = [ColourCounts::default(), ColourCounts::new("reference image")];
+    let colours = [ColourCounts::of_levels(levels), ColourCounts::new("reference image")];
     let loading = Loading {
         options,
         at_once,
@@ -92,6 +131,9 @@ pub(super) fn load(
         let now = now.into_par_iter().map(|(lens, group)| load_group(&lens, group, &loading));
         loaded.extend(now.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
+    if colours[0].is_beyond() {
+        return Ok(None);
+    }
     colours.iter().for_each(ColourCounts::log);
     loaded.sort_by(|a, b| a.name.cmp(&b.name));
     dark_references::drop_from(&mut loaded, options);
@@ -100,7 +142,7 @@ pub(super) fn load(
         views.extend(view);
         skipped.extend(problems);
     }
-    Ok(views)
+    Ok(Some(views))
 }
 
 /// What loading the views has in common.
@@ -333,7 +375,9 @@ impl ViewLoader<'_> {
             depth_map(&path, preparation, options.depth.is_disparity).map_err(unused).ok()
         });
         let view = View::new(&name, split, Camera { view_from_world, ..*camera }, image);
-        let view = View { orientation, original, reference, reference_file, mask, depth, ..view };
+        let unit = colours.levels().unit();
+        let view =
+            View { orientation, original, unit, reference, reference_file, mask, depth, ..view };
         let view = (split == Split::Test || view.has_photograph()).then_some(view);
         Ok(LoadedView { name, view, problems, brightness, reference: reference_original })
     }
@@ -381,6 +425,7 @@ impl ViewLoader<'_> {
         }
         let mut original = Original::new(path, *preparation.lens, options.undistort, turns);
         original.gains = loading.gains;
+        original.levels = loading.colours[0].levels();
         let measured = |image: &Image| match mask {
             Some(mask) => MeasuredPhotograph::measure(&mask.counted(image)),
             None => MeasuredPhotograph::measure(&image.data),

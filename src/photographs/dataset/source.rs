@@ -1,6 +1,6 @@
 //! The files of a view.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use glam::DAffine3;
@@ -50,6 +50,11 @@ impl ViewFiles {
             }
         }
         headers
+    }
+
+    /// The path of the photograph, and its file if that is already read.
+    pub(super) fn photograph(&self) -> Option<(&Path, Option<&PictureFile>)> {
+        Some((self.input.as_deref()?, self.read[0].as_deref()))
     }
 
     /// The photograph as it is stored, white where its alpha hides it; `None` where there is none that decodes.

@@ -50,7 +50,7 @@ impl Dataset {
 }
 
 /// Of how files are read: another where the same file gives other pixels than before.
-const READING: &[u8] = b"in sRGB, turned by what points show";
+const READING: &[u8] = b"in sRGB, signed, at the levels of the set, turned by what points show";
 
 /// Files in the dataset by their path from its root, which may be spelled otherwise, and moved.
 fn write_file(hasher: &mut Hasher, root: &Path, path: &Path) {

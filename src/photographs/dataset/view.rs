@@ -27,6 +27,8 @@ pub struct View {
     pub image: Option<Image>,
     /// Its file, if the stored size is larger or the photograph is not kept.
     pub original: Option<Original>,
+    /// The unit of linear light of the photograph's file, for files of floats that are not relative to white; else 1.
+    pub unit: f32,
     /// The normal-light photograph to score against, of the camera's size; only for test views. Like the photograph, it
     /// is in memory or decoded again ([`View::loaded_reference`]).
     pub reference: Option<Image>,
@@ -49,6 +51,7 @@ impl View {
             orientation: Orientation::UPRIGHT,
             image,
             original: None,
+            unit: 1.0,
             reference: None,
             reference_file: None,
             mask: None,

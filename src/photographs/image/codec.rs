@@ -9,11 +9,12 @@ use ::image::{
     error::UnsupportedErrorKind,
 };
 
-use super::colour::{self, ColourCounts};
+use super::colour::{self, ColourCounts, Conversion};
 use super::decoded::{DecodedImage, Meaning};
 #[cfg(not(feature = "raw"))]
 use super::files::RAW_REMEDY;
 use super::files::{HEIC_REMEDY, is_raw};
+use super::levels::{Levels, SampleFormat, extremes};
 use super::source::{BufReadSeek, not_an_image, reader};
 use super::{Image, Orientation, budget, exr_file, from_interleaved, jpeg, linear_from_srgb};
 use crate::base::output::write_whole;
@@ -56,22 +57,26 @@ impl PictureFile {
 
     /// [`Self::decode`] that counts colour conversions in `counters` instead of logging them.
     pub(crate) fn decode_counted(self, counters: &ColourCounts) -> Result<(Image, Option<Image>)> {
-        let DecodedImage { image, alpha, conversion } =
-            decode(&self.path, self.bytes, Meaning::Colour)?;
-        counters.add(conversion);
-        Ok((image, alpha))
+        let decoded = decode(&self.path, self.bytes, Meaning::Colour, &counters.levels())?;
+        Ok(counters.add(&self.path, decoded))
+    }
+
+    /// The values as parts of the scale of their format; of camera RAW, which has none, as photographs have them.
+    pub(super) fn decode_as_stored(self) -> Result<(Image, Option<SampleFormat>)> {
+        let decoded = decode(&self.path, self.bytes, Meaning::Number, &Levels::default())?;
+        Ok((decoded.image, decoded.format))
     }
 }
 
-fn decode(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<DecodedImage> {
+fn decode(path: &Path, bytes: Vec<u8>, meaning: Meaning, levels: &Levels) -> Result<DecodedImage> {
     budget::check(path, &bytes)?;
     if bytes.starts_with(&exr_file::MAGIC) {
-        return exr_file::load(path, bytes, meaning);
+        return exr_file::load(path, bytes, meaning, levels);
     }
     let is_jpeg = bytes.starts_with(&jpeg::MAGIC);
     let by_libjpeg = if is_jpeg { jpeg::load(path, &bytes)? } else { None };
-    let (mut image, alpha) = match by_libjpeg {
-        Some(image) => (image, None),
+    let (mut image, alpha, format) = match by_libjpeg {
+        Some(image) => (image, None, SampleFormat::Eight),
         None => {
             refuse_heic(path, &bytes)?;
             if is_raw(path) {
@@ -81,14 +86,30 @@ fn decode(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<DecodedImage>
             let decoded = reader.map_err(ImageError::from).and_then(ImageReader::decode);
             let decoded = decoded.map_err(|error| undecodable(path, &error))?;
             let alpha = alpha_of(&decoded);
-            (from_decoded(decoded), alpha)
+            let (image, format) = from_decoded(decoded);
+            (image, alpha, format)
         }
     };
     if meaning == Meaning::Number {
-        return Ok(DecodedImage::as_stored(image, alpha));
+        let stored = DecodedImage::as_stored(image, alpha);
+        return Ok(DecodedImage { format: Some(format), ..stored });
     }
-    let conversion = colour::convert(&mut image, &bytes);
-    Ok(DecodedImage { image, alpha, conversion })
+    let remark = if format == SampleFormat::Sixteen { one_value(&image) } else { None };
+    let is_beyond = levels.apply(&mut image, format);
+    let conversion = match levels.are_linear() {
+        true => Conversion::default(),
+        false => colour::convert(&mut image, &bytes),
+    };
+    Ok(DecodedImage { image, alpha, conversion, format: Some(format), is_beyond, remark })
+}
+
+/// A line where all values of a file of 16 bits are the same.
+fn one_value(image: &Image) -> Option<String> {
+    let [least, most] = extremes(image);
+    let code = (65_535.0 * most).round();
+    (least == most).then(|| {
+        format!("every value is {code} of 65535: it shows nothing; leave it out or export it again")
+    })
 }
 
 /// The alpha of a decoded image in all three planes; `None` if it is opaque.
@@ -156,16 +177,21 @@ impl Image {
     /// Colours are converted to sRGB by the file's ICC profile, the chunks of a PNG, the chromaticities of an EXR, or
     /// Exif; a profile that cannot be used is named in a warning, and the values count as sRGB. Colours outside sRGB
     /// are clipped. Alpha is dropped, grey is repeated, and camera RAW (feature `raw`) is linear light. The R, G and B
-    /// (or Y) of an EXR file's first layer are linear light; values that are negative or not finite become 0, with a
-    /// warning that counts them ([`super::Mask::load`] masks the latter).
+    /// (or Y) of an EXR file's first layer are linear light; values that are not finite become 0, with a warning that
+    /// counts them ([`super::Mask::load`] masks them). Light of RAW and EXR keeps its sign: noise at black is negative,
+    /// too.
     ///
     /// # Errors
     /// [`Error::Input`] if the file cannot be read, is truncated or has another format.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
         let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
-        let DecodedImage { image, conversion, .. } = decode(&path, bytes, Meaning::Colour)?;
+        let DecodedImage { image, conversion, remark, .. } =
+            decode(&path, bytes, Meaning::Colour, &Levels::default())?;
         if let Some(problem) = conversion.unknown {
             tracing::warn!("{}: {problem} is not used; the colours count as sRGB", path.display());
+        }
+        if let Some(remark) = remark {
+            tracing::warn!("{}: {remark}", path.display());
         }
         Ok(image)
     }
@@ -180,7 +206,11 @@ impl Image {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
         let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
-        Ok(decode(&path, bytes, Meaning::Number)?.image)
+        let decoded = decode(&path, bytes, Meaning::Number, &Levels::default())?;
+        if let Some(remark) = decoded.remark {
+            tracing::warn!("{}: {remark}", path.display());
+        }
+        Ok(decoded.image)
     }
 
     /// Width and height of an image file, from its header alone.
@@ -316,7 +346,7 @@ fn raw_size(path: &Path, _: Vec<u8>) -> Result<(u32, u32)> {
     load_raw(path, vec![]).map(|image| (image.width, image.height))
 }
 
-fn from_decoded(decoded: DynamicImage) -> Image {
+fn from_decoded(decoded: DynamicImage) -> (Image, SampleFormat) {
     let (width, height) = (decoded.width(), decoded.height());
     let wide = decoded.color().bytes_per_pixel() > decoded.color().channel_count();
     let interleaved: Vec<f32> = if wide {
@@ -324,7 +354,8 @@ fn from_decoded(decoded: DynamicImage) -> Image {
     } else {
         decoded.into_rgb8().iter().map(|&value| f32::from(value) / 255.0).collect()
     };
-    from_interleaved(width, height, &interleaved)
+    let format = if wide { SampleFormat::Sixteen } else { SampleFormat::Eight };
+    (from_interleaved(width, height, &interleaved), format)
 }
 
 #[cfg(test)]
@@ -370,21 +401,22 @@ mod tests {
         assert!(worst(&Image::load(&path).unwrap(), &image) <= 0.5 / 255.0 + 1e-6);
         image.save_png16(&path).unwrap();
         assert!(worst(&Image::load(&path).unwrap(), &image) <= 0.5 / 65_535.0 + 1e-6);
-        let bright = Image { data: image.data.iter().map(|value| 3.0 * value).collect(), ..image };
+        let bright = |value: &f32| 3.0 * value - 0.5;
+        let bright = Image { data: image.data.iter().map(bright).collect(), ..image };
         bright.save_exr(&path).unwrap();
         assert!(worst(&Image::load(&path).unwrap(), &bright) < 1e-5);
         assert_eq!(Image::size_of(&path).unwrap(), (7, 5));
     }
 
     #[test]
-    fn an_exr_is_linear_light_and_its_unusable_values_count_as_black() {
+    fn an_exr_is_linear_light_with_its_sign_and_what_is_not_finite_counts_as_black() {
         let (path, _folder) = file("a.exr");
         let values = [0.5_f32, 0.001, f32::NAN, f32::INFINITY, -0.5, 4.0];
         exr::prelude::write_rgb_file(&path, 6, 1, |x, _| (values[x], values[x], values[x]))
             .unwrap();
         let loaded = Image::load(&path).unwrap();
         let expected =
-            [0.735_357, 0.012_92, 0.0, 0.0, 0.0, 1.055 * 4.0_f32.powf(1.0 / 2.4) - 0.055];
+            [0.735_357, 0.012_92, 0.0, 0.0, -0.735_357, 1.055 * 4.0_f32.powf(1.0 / 2.4) - 0.055];
         for (x, expected) in expected.into_iter().enumerate() {
             assert!((loaded.data[x] - expected).abs() < 1e-5, "{}: {}", values[x], loaded.data[x]);
         }
@@ -403,7 +435,57 @@ mod tests {
         let [red, green, blue] = Image::load(&path).unwrap().pixel(2, 1);
         assert!((red - 0.735_357).abs() < 1e-5 && red == green && green == blue);
         save("Z");
-        assert!(Image::load(&path).unwrap_err().to_string().contains("neither R nor Y"));
+        let error = Image::load(&path).unwrap_err().to_string();
+        assert!(error.contains("neither R nor Y, but Z;"), "{error}");
+    }
+
+    #[test]
+    fn the_picture_of_an_exr_with_layers_is_read_where_only_one_can_be_meant() {
+        use exr::prelude::{AnyChannel, AnyChannels, FlatSamples, WritableImage};
+        let (path, _folder) = file("a.exr");
+        let loaded = |groups: &[&str]| {
+            let channel = |(value, name): (usize, String)| {
+                AnyChannel::new(name.as_str(), FlatSamples::F32(vec![value as f32 / 16.0; 6]))
+            };
+            let names =
+                groups.iter().flat_map(|group| ["R", "G", "B"].map(|c| format!("{group}{c}")));
+            let channels = (1..).zip(names).map(channel).collect();
+            let channels = AnyChannels::sort(channels);
+            exr::image::Image::from_channels((3, 2), channels).write().to_file(&path).unwrap();
+            Image::load(&path).map(|image| image.pixel(2, 1).map(linear_from_srgb))
+        };
+        let close = |found: [f32; 3], expected: [f32; 3]| {
+            found.iter().zip(expected).all(|(a, b)| (a - b / 16.0).abs() < 1e-6)
+        };
+        assert!(close(loaded(&["ViewLayer.Combined."]).unwrap(), [1.0, 2.0, 3.0]));
+        assert!(close(loaded(&["A.Diffuse.", "A.Combined."]).unwrap(), [4.0, 5.0, 6.0]));
+        let error = loaded(&["Left.", "Right."]).unwrap_err().to_string();
+        assert!(error.contains("but Left.B, Left.G, Left.R, Right.B"), "{error}");
+    }
+
+    #[test]
+    fn a_file_that_shows_nothing_is_named() {
+        let (path, _folder) = file("a");
+        let remark = |save: &dyn Fn()| {
+            save();
+            let bytes = std::fs::read(&path).unwrap();
+            let decoded = decode(&path, bytes, Meaning::Colour, &Levels::default());
+            decoded.unwrap().remark.unwrap_or_default()
+        };
+        let exr = |value: &dyn Fn(u32) -> f32| {
+            let image = Image::from_fn(4, 1, |x, _| [value(x); 3]);
+            remark(&|| image.save_exr_as_stored(&path).unwrap())
+        };
+        let one = Image::filled(4, 4, [700.0 / 65_535.0; 3]);
+        let sixteen = remark(&|| one.save_png16(&path).unwrap());
+        assert!(sixteen.contains("every value is 700 of 65535"), "{sixteen}");
+        assert_eq!(remark(&|| gradient(4, 4).save_png16(&path).unwrap()), "");
+        assert!(exr(&|_| 0.25).contains("every value is 0.25"));
+        assert!(exr(&|x| -1.0 - x as f32).contains("every value is negative, -1 at most"));
+        assert!(
+            exr(&|x| if x == 1 { f32::NAN } else { x as f32 }).contains("3 values are not finite")
+        );
+        assert_eq!(exr(&|x| x as f32 - 1.0), "");
     }
 
     #[test]

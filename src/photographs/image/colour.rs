@@ -59,8 +59,8 @@ pub(super) fn convert(image: &mut Image, bytes: &[u8]) -> Conversion {
     Conversion { from: None, unknown }
 }
 
-/// Converts linear light of other primaries to those of sRGB. Values that become negative are set to 0; negative input
-/// is kept.
+/// Converts linear light of other primaries to those of sRGB. Negative values are kept: those of noise at black have to,
+/// and others say the same of a colour outside sRGB.
 pub(super) fn convert_linear(image: &mut Image, chromaticities: Chromaticities) -> Conversion {
     /// A code value of 8 bits near black.
     const MARGIN: f64 = 1.0 / 255.0 / 12.92;
@@ -76,13 +76,13 @@ pub(super) fn convert_linear(image: &mut Image, chromaticities: Chromaticities) 
     for at in 0..count {
         let stored =
             DVec3::from_array([0, 1, 2].map(|plane| f64::from(image.data[plane * count + at])));
-        if !(stored.is_finite() && stored.min_element() >= 0.0) {
+        if !stored.is_finite() {
             continue;
         }
         let linear = matrix * stored;
         outside += usize::from(linear.min_element() < -MARGIN);
         for (plane, value) in linear.to_array().into_iter().enumerate() {
-            image.data[plane * count + at] = value.max(0.0) as f32;
+            image.data[plane * count + at] = value as f32;
         }
     }
     let name = known_name(matrix).unwrap_or("other primaries").to_owned();
@@ -274,7 +274,7 @@ impl ColourSpace {
     /// The sRGB encoding of linear light in this space, unclamped.
     fn encoded(&self, linear: [f32; 3]) -> [f32; 3] {
         let linear = self.matrix * DVec3::from_array(linear.map(f64::from));
-        linear.to_array().map(|value| encode(value as f32))
+        linear.to_array().map(|value| srgb_from_linear(value as f32))
     }
 
     /// Converts an image and clamps it; returns the fraction of pixels outside sRGB.
@@ -303,11 +303,6 @@ impl ColourSpace {
         }
         outside as f64 / count.max(1) as f64
     }
-}
-
-/// The encoded value of linear light, continued below 0.
-fn encode(linear: f32) -> f32 {
-    srgb_from_linear(linear.abs()).copysign(linear)
 }
 
 fn srgb_curve() -> Curve {

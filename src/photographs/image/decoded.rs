@@ -2,6 +2,7 @@
 
 use super::Image;
 use super::colour::Conversion;
+use super::levels::SampleFormat;
 
 /// The meaning of the values of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -17,11 +18,24 @@ pub(super) struct DecodedImage {
     pub(super) image: Image,
     pub(super) alpha: Option<Image>,
     pub(super) conversion: Conversion,
+    /// `None` for camera RAW.
+    pub(super) format: Option<SampleFormat>,
+    /// A value is beyond the levels of the set.
+    pub(super) is_beyond: bool,
+    /// What is unusual about the values, without the file's name.
+    pub(super) remark: Option<String>,
 }
 
 impl DecodedImage {
     /// Values that are not colours, or are sRGB already.
     pub(super) fn as_stored(image: Image, alpha: Option<Image>) -> Self {
-        Self { image, alpha, conversion: Conversion::default() }
+        Self {
+            image,
+            alpha,
+            conversion: Conversion::default(),
+            format: None,
+            is_beyond: false,
+            remark: None,
+        }
     }
 }

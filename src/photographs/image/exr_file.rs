@@ -8,6 +8,7 @@ use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableIma
 
 use super::colour::{self, Chromaticities, Conversion};
 use super::decoded::{DecodedImage, Meaning};
+use super::levels::{Levels, SampleFormat, extremes};
 use super::source::{BufReadSeek, not_an_image};
 use super::{Image, srgb_from_linear};
 use crate::base::output::write_whole;
@@ -16,9 +17,14 @@ use crate::{Error, Result};
 /// The magic number of EXR files.
 pub(super) const MAGIC: [u8; 4] = [0x76, 0x2F, 0x31, 0x01];
 
-/// The first layer's R, G and B (or Y), and the mask of its finite pixels. Colours are encoded as sRGB; those that are
-/// negative or not finite become 0, with a warning that counts them.
-pub(super) fn load(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<DecodedImage> {
+/// The first layer's R, G and B (or Y), and the mask of its finite pixels. Colours are encoded as sRGB, with their sign;
+/// those that are not finite become 0, and are counted in a remark.
+pub(super) fn load(
+    path: &Path,
+    bytes: Vec<u8>,
+    meaning: Meaning,
+    levels: &Levels,
+) -> Result<DecodedImage> {
     let (mut image, chromaticities) = decoded(path, bytes)?;
     let alpha = finite_part(&image);
     let conversion = match chromaticities {
@@ -28,23 +34,27 @@ pub(super) fn load(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Deco
         _ => Conversion::default(),
     };
     let mut replaced = 0_usize;
-    for value in &mut image.data {
-        let usable = match meaning {
-            Meaning::Colour => {
-                (*value >= 0.0 && value.is_finite()).then(|| srgb_from_linear(*value))
-            }
-            Meaning::Number => value.is_finite().then_some(*value),
-        };
-        replaced += usize::from(usable.is_none());
-        *value = usable.unwrap_or(0.0);
+    for value in image.data.iter_mut().filter(|value| !value.is_finite()) {
+        replaced += 1;
+        *value = 0.0;
     }
-    if replaced > 0 {
-        tracing::warn!(
-            "{}: {replaced} values are negative colours or not finite; they count as 0",
-            path.display()
-        );
+    let remark = match extremes(&image) {
+        _ if replaced > 0 => Some(format!("{replaced} values are not finite: masked")),
+        _ if meaning == Meaning::Number => None,
+        [least, most] if least == most => Some(format!(
+            "every value is {most}: it shows nothing; leave it out or export it again"
+        )),
+        [_, most] if most < 0.0 => {
+            Some(format!("every value is negative, {most} at most: it is black; export it again"))
+        }
+        _ => None,
+    };
+    if meaning == Meaning::Colour {
+        levels.apply(&mut image, SampleFormat::Float);
+        image.data.iter_mut().for_each(|value| *value = srgb_from_linear(*value));
     }
-    Ok(DecodedImage { image, alpha, conversion })
+    let format = Some(SampleFormat::Float);
+    Ok(DecodedImage { image, alpha, conversion, format, is_beyond: false, remark })
 }
 
 /// 1 at pixels whose values are all finite, 0 elsewhere, in all three planes; `None` if all are finite.
@@ -74,12 +84,20 @@ fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>
     });
     let layer = image.layer_data;
     let pixels = layer.size.width() * layer.size.height();
-    let channel = |name: &str| layer.channel_data.list.iter().find(|channel| channel.name.eq(name));
+    let names: Vec<String> =
+        layer.channel_data.list.iter().map(|channel| channel.name.to_string()).collect();
+    let group = group(&names);
     let mut data = Vec::with_capacity(3 * pixels);
     for name in ["R", "G", "B"] {
-        let channel = channel(name).or_else(|| channel("Y"));
-        let channel = channel
-            .ok_or_else(|| Error::input(path, format!("this EXR file has neither {name} nor Y")))?;
+        let named = [format!("{group}{name}"), "Y".to_owned()];
+        let at = named.iter().find_map(|name| names.iter().position(|other| other == name));
+        let channel = at.map(|at| &layer.channel_data.list[at]).ok_or_else(|| {
+            let problem = format!(
+                "this EXR file has neither {name} nor Y, but {}; export one layer as R, G and B",
+                names.join(", ")
+            );
+            Error::input(path, problem)
+        })?;
         if channel.sample_data.len() != pixels {
             let problem = "this EXR file has subsampled channels; save it as plain RGB";
             return Err(Error::input(path, problem));
@@ -88,6 +106,22 @@ fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>
     }
     let (width, height) = (layer.size.width() as u32, layer.size.height() as u32);
     Ok((Image { width, height, data }, chromaticities))
+}
+
+/// What precedes the names of red, green and blue: nothing, or that of the only group of channels that has all three, or
+/// of the only one that is called `Combined`, as Blender calls the picture.
+fn group(names: &[String]) -> &str {
+    let has = |name: String| names.contains(&name);
+    let is_whole = |group: &&str| ["G", "B"].iter().all(|color| has(format!("{group}{color}")));
+    let groups = names.iter().filter_map(|name| name.strip_suffix('R')).filter(is_whole);
+    let mut groups: Vec<&str> = groups.collect();
+    if groups.iter().any(|group| group.ends_with("Combined.")) {
+        groups.retain(|group| group.ends_with("Combined."));
+    }
+    match groups[..] {
+        [only] if !names.iter().any(|name| name == "R" || name == "Y") => only,
+        _ => "",
+    }
 }
 
 /// Writes R, G and B as 32-bit floats, each value through `to_exr_value`, with these numbers in the header.

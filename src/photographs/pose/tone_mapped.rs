@@ -8,7 +8,9 @@ use crate::base::input;
 use crate::base::output::create_folder;
 use crate::gpu::Gpu;
 use crate::photographs::image::files::stem;
-use crate::photographs::image::{ColourCounts, Image, PictureFile, exif_segment};
+use crate::photographs::image::{
+    ColourCounts, Image, Levels, PictureFile, StoredLight, exif_segment,
+};
 use crate::photographs::targets::{SceneTone, Targets};
 use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 
@@ -21,6 +23,7 @@ use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 pub(super) fn write(
     gpu: &Gpu,
     photographs: &mut Vec<PathBuf>,
+    light: Option<StoredLight>,
     folder: &Path,
     report: &dyn Fn(PoseProgress<'_>),
 ) -> Result<f64> {
@@ -29,7 +32,10 @@ pub(super) fn write(
     let settings = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
     let (mut done, all) = (0, photographs.len());
     let root = photographs.first().and_then(|path| path.parent()).unwrap_or(folder).to_owned();
-    let colours = ColourCounts::default();
+    let paths: Vec<&Path> = photographs.iter().map(PathBuf::as_path).collect();
+    let levels = Levels::of_all(light, &paths);
+    levels.say();
+    let colours = ColourCounts::of_levels(levels);
     let (mut measured, mut undecoded) = (vec![], None);
     photographs.retain(|path| {
         done += 1;
@@ -51,7 +57,7 @@ pub(super) fn write(
     let scene = SceneTone::from_photographs(&settings, &measured);
     let targets = Targets::in_scene(gpu, scene.ok_or_else(|| all_black(&root))?)?;
     for (at, (path, measured)) in photographs.iter().zip(&measured).enumerate() {
-        let (photograph, _) = PictureFile::open(path)?.decode()?;
+        let (photograph, _) = PictureFile::open(path)?.decode_counted(&colours)?;
         let image = targets.tone_mapped(&photograph, measured)?;
         let file = folder.join(name(path));
         if is_jpeg(path) {

@@ -38,10 +38,23 @@ impl<T: Real> Curve<T> {
     }
 }
 
-/// The pseudo-GT value in [0, 1] of the sRGB-encoded value `x` under the curve `curve` (a `CURVE_*`), as the kernels of
-/// `include/tone.glsl` compute it.
+/// The pseudo-GT value of the sRGB-encoded value `x` under the curve `curve` (a `CURVE_*`), as the kernels of
+/// `include/tone.glsl` compute it: in [0, 1] from 0 on, and [`mirrored`] below.
 pub(crate) fn tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> f32 {
-    clamped(curve_at(curve, x / tone.white, [tone.offset, tone.gain], &tone.constants))
+    let scale = [tone.offset, tone.gain];
+    mirrored(x, |x| clamped(curve_at(curve, x / tone.white, scale, &tone.constants)))
+}
+
+/// A curve T below 0, where noise at black is: 2 T(0) - T(-x). It goes on with its slope at 0, and noise that is
+/// symmetric has no bias there; a straight line would have one wherever the curve bends within the noise.
+pub(crate) fn mirrored<T: Real>(x: T, curve: impl Fn(T) -> T) -> T {
+    let zero = T::from_f64(0.0);
+    if x < zero { T::from_f64(2.0) * curve(zero) - curve(-x) } else { curve(x) }
+}
+
+/// A value within `most` of 0; a NaN counts as 0.
+pub(crate) fn bounded(x: f32, most: f32) -> f32 {
+    if x.is_nan() { 0.0 } else { x.clamp(-most, most) }
 }
 
 /// The curve at t = x / white, unclamped.

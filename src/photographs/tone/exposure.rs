@@ -18,7 +18,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::histogram::LuminanceHistogram;
-use super::metering::{CurveEnds, Metering, gain_at, mean_of_soft};
+use super::metering::{CurveEnds, GAINS, Metering, gain_at, mean_of_soft};
 use crate::camera::{Camera, CameraPoses};
 
 /// The minimum weight of a view's own gain if cameras are unknown.
@@ -230,6 +230,9 @@ impl Exposure {
         let brightening = self.brightening();
         let verdict = match self.weight() {
             0.0 => "well lit, no curve".to_owned(),
+            1.0 if *gain > 0.999 * GAINS[1] => format!(
+                "gain {gain:.1}, its limit (if 16-bit files hold linear light, say `--light linear`)"
+            ),
             1.0 => format!("gain {gain:.1}"),
             weight => format!("{:.0} % of a curve of gain {gain:.1}", 100.0 * weight),
         };
@@ -313,8 +316,8 @@ impl From<Exposure> for SerializedExposure {
 
 /// The error if every photograph is black.
 pub(crate) fn all_black(path: &std::path::Path) -> crate::Error {
-    let problem = "every photograph is almost black (99 % of its pixels are below 2 of 255); expose longer, or name \
-                   a curve with --curve";
+    let problem = "every photograph is almost black (99 % of its pixels are below 2 of 255); expose longer, name a \
+                   curve with --curve, or say `--light linear` if 16-bit files hold linear light";
     crate::Error::input(path, problem)
 }
 

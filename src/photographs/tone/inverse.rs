@@ -2,11 +2,12 @@
 //!
 //! Most curves map each value separately, and increase: the inverse of a value is found by bisection. The automatic
 //! curve scales a part of each channel by the curve of the luminance Y, s(Y) / Y. For a given Y it increases in each
-//! channel, and a larger Y gives larger values; so the Y that its own values have is found by iteration from below.
+//! channel, and a larger Y gives larger values; so the Y that its own values have is found by iteration from below. A
+//! target below that of black is inverted in the mirror, as the curve is continued below 0.
 //! Where a curve is flat, no inverse is accurate: values within half a code of 8 bits of its maximum become those of
 //! that limit, and are counted.
 
-use super::curve::{Curve, clamped};
+use super::curve::{Curve, clamped, mirrored};
 use super::metering::{shoulder, toe};
 use super::{SceneLaw, Table, Tone, ToneParameters, ToneSettings};
 use crate::kernels::curves::{CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_TABLE};
@@ -36,7 +37,7 @@ pub struct InverseTone {
 /// A colour of a photograph, and whether the curve is flat where it was found.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Inverted {
-    /// sRGB-encoded; above 1 where the curve allows.
+    /// sRGB-encoded; above 1 where the curve allows, and negative below black.
     pub rgb: [f64; 3],
     /// A channel is that of the largest value that is inverted.
     pub is_clipped: bool,
@@ -79,6 +80,10 @@ impl InverseTone {
 
     /// The target of one channel. `factor`: s(Y) / Y of the pixel's luminance, if the curve uses it.
     fn channel(&self, x: f64, channel: usize, factor: f64) -> f64 {
+        mirrored(x, |x| self.channel_above_black(x, channel, factor))
+    }
+
+    fn channel_above_black(&self, x: f64, channel: usize, factor: f64) -> f64 {
         let Curve { number, white, offset, gain, constants } = &self.curve;
         let t = x / white;
         let curved = match *number {
@@ -98,14 +103,24 @@ impl InverseTone {
 
     /// The factor s(Y) / Y of the automatic curve.
     fn factor(&self, rgb: [f64; 3]) -> f64 {
-        let y = (luminance(rgb) / self.curve.white).max(1e-20);
+        let y = (luminance(rgb).abs() / self.curve.white).max(1e-20);
         shoulder(y, self.curve.constants[1]) / y
+    }
+
+    /// The target of no light.
+    fn black(&self, channel: usize) -> f64 {
+        self.channel(0.0, channel, 0.0)
     }
 
     /// The value of a photograph whose target is `value`.
     fn solved(&self, value: f64, channel: usize, factor: f64) -> f64 {
+        let black = self.black(channel);
+        if value < black {
+            let mirror = (2.0 * black - value).min(self.largest[channel]);
+            return -self.solved(mirror, channel, factor);
+        }
         // Written so that a NaN is black.
-        let is_lit = value > self.channel(0.0, channel, factor);
+        let is_lit = value > black;
         if !is_lit {
             return 0.0;
         }
@@ -125,6 +140,12 @@ impl InverseTone {
             }
         }
         0.5 * (low + high)
+    }
+
+    /// A target without light below black: what is shown is cut there. A NaN is black.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn shown(&self, target: [f64; 3]) -> [f64; 3] {
+        [0, 1, 2].map(|channel| target[channel].max(self.black(channel)))
     }
 
     /// A target with at most the largest values that are inverted. Written so that a NaN stays one, and becomes black.
@@ -152,7 +173,7 @@ impl InverseTone {
         let mut before: Option<[f64; 2]> = None;
         for _ in 0..TRIALS {
             let error = step(y) - y;
-            if error.abs() <= PRECISION * y {
+            if error.abs() <= PRECISION * y.abs() {
                 break;
             }
             let next = match before {
@@ -162,7 +183,7 @@ impl InverseTone {
                 _ => y + error,
             };
             before = Some([y, error]);
-            y = if next.is_finite() && next > 0.0 { next } else { y + error };
+            y = if next.is_finite() && next * y > 0.0 { next } else { y + error };
         }
         rgb = solved(self.factor([y; 3]));
         Inverted { rgb, is_clipped }
@@ -196,7 +217,9 @@ mod tests {
     /// Dark colours, and some near and above white.
     fn colours() -> Vec<[f64; 3]> {
         let value = |i: usize| 1.2 * (i as f64 / 40.0).powi(4) + 1e-4;
-        (0..40).map(|i| [value(i), value((7 * i + 3) % 40), value((11 * i + 5) % 40)]).collect()
+        let lit = |i: usize| [value(i), value((7 * i + 3) % 40), value((11 * i + 5) % 40)];
+        let below = |i: usize| [-1e-3 * i as f64, -2e-3, 4e-4 * i as f64];
+        (0..40).map(lit).chain((1..9).map(below)).collect()
     }
 
     fn inverse(settings: &ToneSettings) -> InverseTone {
@@ -252,7 +275,7 @@ mod tests {
             assert!(is_clipped && rgb.iter().all(|x| x.is_finite()), "{rgb:?}");
         }
         let dark = inverse.invert([f64::NAN, -1.0, 0.0]);
-        assert_eq!(dark, Inverted { rgb: [0.0; 3], is_clipped: false });
+        assert!(dark.rgb[0] == 0.0 && dark.rgb[1] < dark.rgb[2] && !dark.is_clipped, "{dark:?}");
     }
 
     #[test]

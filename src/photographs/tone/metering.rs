@@ -97,14 +97,20 @@ pub(crate) fn shoulder<T: Real>(t: T, s: T) -> T {
 }
 
 /// The toe: from `black` to 0 and from `end` to itself, with a quarter of the slope of a line at black; values above
-/// `end`, and all of weight 0, are unchanged.
+/// `end`, and all of weight 0, are unchanged. Values below `black` are mirrored.
 pub(crate) fn toe<T: Real>(value: T, black: T, [end, weight]: [T; 2]) -> T {
     if !(weight > T::from_f64(0.0) && value < end) {
         return value;
     }
-    let [quarter, three_quarters] = [0.25, 0.75].map(T::from_f64);
+    let [zero, one, two, quarter] = [0.0, 1.0, 2.0, 0.25].map(T::from_f64);
     let s = (value - black) / (end - black);
-    value + weight * (end * s * (quarter + three_quarters * s) - value)
+    if s > -one {
+        let size = if s < zero { -s } else { s };
+        value + weight * (end * s * (quarter + (one - quarter) * size) - value)
+    } else {
+        // The mirror of what is above the toe.
+        value - two * weight * black
+    }
 }
 
 /// How the gains of a scene's photographs are chosen.

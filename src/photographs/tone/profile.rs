@@ -90,7 +90,7 @@ impl Profile {
         format!("a camera profile of {pairs} of {reference}")
     }
 
-    /// The colour of k x, in [0, 1].
+    /// The colour of k x, in [0, 1] if no channel is negative.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn value(&self, t: [f64; 3]) -> [f64; 3] {
         profiled(t, &self.numbers())
@@ -113,19 +113,22 @@ impl Profile {
     }
 }
 
-/// The colour of t = k x under a profile, in [0, 1]; `profile` is (3, `PROFILE_WIDTH`).
+/// The colour of t = k x under a profile, in [0, 1]; `profile` is (3, `PROFILE_WIDTH`). Negative channels add what they
+/// weigh at the slope of the first segment.
 pub(crate) fn profiled<T: Real>(t: [T; 3], profile: &[T]) -> [T; 3] {
     let [zero, one] = [0.0, 1.0].map(T::from_f64);
     let unit = |x: T| x.at_least(zero).at_most(one);
-    let v = t.map(T::one_minus_exp);
+    let count = T::from_f64(SEGMENTS.into());
+    let above = t.map(|t| t.at_least(zero).one_minus_exp());
+    let below = t.map(|t| (-t).at_least(zero).one_minus_exp());
     [0, 1, 2].map(|channel| {
         let numbers = &profile[channel * PROFILE_WIDTH as usize..][..PROFILE_WIDTH as usize];
-        let u = numbers[0] * v[0] + numbers[1] * v[1] + numbers[2] * v[2] + numbers[3];
-        let scaled = T::from_f64(SEGMENTS.into()) * unit(u);
+        let mixed = |v: [T; 3]| numbers[0] * v[0] + numbers[1] * v[1] + numbers[2] * v[2];
+        let scaled = count * unit(mixed(above) + numbers[3]);
         let y = numbers[5..].iter().zip(0..SEGMENTS).fold(numbers[4], |y, (&rise, segment)| {
             y + rise * unit(scaled - T::from_f64(segment.into()))
         });
-        unit(y)
+        (unit(y) - count * numbers[5] * mixed(below)).at_least(-one)
     })
 }
 

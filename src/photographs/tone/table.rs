@@ -3,7 +3,7 @@
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use super::curve::clamped;
+use super::curve::mirrored;
 use super::real::Real;
 
 /// Values of a curve, interpolated by monotone cubics (Fritsch and Carlson 1980); beyond its ends the curve is
@@ -119,10 +119,10 @@ impl Table {
             .collect()
     }
 
-    /// The table at `x`, in [0, 1], for a channel from 0 to 2.
+    /// The table at `x`, in [0, 1], for a channel from 0 to 2; mirrored below 0 if it does not begin there.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn value(&self, x: f64, channel: usize) -> f64 {
-        clamped(interpolate(&self.channel(channel), x))
+        table_at(&self.channel(channel), x)
     }
 
     fn channel(&self, channel: usize) -> Vec<[f64; 3]> {
@@ -132,8 +132,14 @@ impl Table {
     }
 }
 
+/// The table with these knots of a channel at x, in [0, 1]; below 0 it is mirrored, unless it has knots there.
+pub(crate) fn table_at<T: Real>(knots: &[[T; 3]], x: T) -> T {
+    let value = |x| interpolate(knots, x).at_least(T::from_f64(0.0)).at_most(T::from_f64(1.0));
+    if knots[0][0] < T::from_f64(0.0) { value(x) } else { mirrored(x, value) }
+}
+
 /// The cubic Hermite curve through knots (x, y, slope); beyond the ends it is constant.
-pub(crate) fn interpolate<T: Real>(knots: &[[T; 3]], x: T) -> T {
+fn interpolate<T: Real>(knots: &[[T; 3]], x: T) -> T {
     let [first, last] = [knots[0], knots[knots.len() - 1]];
     // Written so that a NaN counts as the lower end.
     let x = if x > first[0] { x.at_most(last[0]) } else { first[0] };

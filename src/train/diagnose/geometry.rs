@@ -9,7 +9,7 @@ use crate::Result;
 use crate::camera::Camera;
 use crate::photographs::dataset::{Dataset, Point, View};
 use crate::photographs::image::{Image, linear_from_srgb};
-use crate::photographs::tone::{luminance, measurable};
+use crate::photographs::tone::{bounded, luminance};
 use crate::splats::scene::init;
 
 /// Random points in front of the cameras if the dataset has none.
@@ -155,11 +155,12 @@ fn light_around(image: &Image, at: DVec2) -> Option<(f64, bool)> {
     }
     let (mut sum, mut zeros) = (0.0, 0_usize);
     for (dy, dx) in (-REACH..=REACH).flat_map(|dy| (-REACH..=REACH).map(move |dx| (dy, dx))) {
-        let rgb = image.pixel((x + dx) as u32, (y + dy) as u32).map(measurable);
+        let rgb = image.pixel((x + dx) as u32, (y + dy) as u32).map(|x| bounded(x, f32::MAX));
         if rgb.iter().any(|&value| value >= 1.0) {
             return None;
         }
-        zeros += rgb.iter().filter(|&&value| value <= 0.0).count();
+        // Noise below black is not cut.
+        zeros += rgb.iter().filter(|&&value| value == 0.0).count();
         sum += f64::from(luminance(rgb.map(linear_from_srgb)));
     }
     let pixels = ((2 * REACH + 1) as f64).powi(2);

@@ -5,7 +5,7 @@ use super::sharpness;
 use super::target_noise::{TargetNoise, target_noise};
 use crate::photographs::image::{Image, Mask, linear_from_srgb};
 use crate::photographs::targets::SceneTone;
-use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, luminance, measurable};
+use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, bounded, luminance, measurable};
 
 /// Blur is measured in the middle of the photograph, in at most this many pixels each way.
 const BLUR_SIDE: u32 = 640;
@@ -59,7 +59,7 @@ impl PhotographStatistics {
             light: mean(&luminance),
             // Written so that a NaN is neither.
             clipped_fraction: fraction(|value| value >= 1.0),
-            zero_fraction: fraction(|value| value <= 0.0),
+            zero_fraction: fraction(|value| value == 0.0),
             code_values: code_values(counted),
             noise: noise::fit(patches.clone()),
             patches,
@@ -69,6 +69,9 @@ impl PhotographStatistics {
         }
     }
 }
+
+/// The largest value that is measured.
+const LARGEST: f32 = 65504.0;
 
 /// The planes in linear light.
 struct Linear {
@@ -87,7 +90,8 @@ impl Linear {
             image.data.iter().all(is_whole)
         });
         let Some(levels) = levels else {
-            let planes = image.data.iter().map(|&value| linear_from_srgb(measurable(value)));
+            // Signed: noise that is cut at black is underestimated.
+            let planes = image.data.iter().map(|&value| linear_from_srgb(bounded(value, LARGEST)));
             return Self { planes: planes.collect(), step: 0.0 };
         };
         let table: Vec<f32> =

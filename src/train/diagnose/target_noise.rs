@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use super::geometry::median;
 use crate::photographs::image::Image;
-use crate::photographs::tone::{InverseTone, luminance, measurable};
+use crate::photographs::tone::{InverseTone, bounded, luminance};
 
 /// Side of a patch, pixels.
 const SIDE: u32 = 32;
@@ -78,7 +78,7 @@ impl TargetPatch {
         for y in 0..side {
             for x in 0..side {
                 let stored = image.pixel(left + STRIDE * x, top + STRIDE * y);
-                let target = curve.target(stored.map(|x| measurable(x).into()));
+                let target = curve.target(stored.map(|x| bounded(x, 65504.0).into()));
                 let rgb = target.map(|value| value.min(1.0) as f32);
                 let luma = f64::from(luminance(rgb));
                 let [red, _, blue] = rgb.map(f64::from);

@@ -8,8 +8,10 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use nightsplat::photographs::pseudo_gt::PseudoGt;
 use nightsplat::photographs::targets::SceneTone;
-use nightsplat::photographs::tone::{InverseTone, MeasuredPhotograph, ToneSettings};
+use nightsplat::photographs::tone::{InverseTone, MeasuredPhotograph, ToneCurve, ToneSettings};
 
+use super::Folder;
+use crate::common::Random;
 use crate::common::command::succeed;
 
 /// Sensor values without light, and at saturation.
@@ -25,7 +27,17 @@ fn counted(light: [f32; 3]) -> [u16; 3] {
 }
 
 /// A minimal linear DNG: 16-bit pixels of three colours in one strip, the camera's neutral, black and white levels.
-fn dng(width: u16, height: u16, pixel: impl Fn(u16, u16) -> [u16; 3]) -> Vec<u8> {
+fn dng(width: u16, height: u16, pixel: impl FnMut(u16, u16) -> [u16; 3]) -> Vec<u8> {
+    dng_of(width, height, false, pixel)
+}
+
+/// [`dng`], or one of a mosaic: red, green; green, blue.
+fn dng_of(
+    width: u16,
+    height: u16,
+    is_mosaic: bool,
+    mut pixel: impl FnMut(u16, u16) -> [u16; 3],
+) -> Vec<u8> {
     let short = |values: &[u16]| {
         (
             3_u16,
@@ -45,35 +57,42 @@ fn dng(width: u16, height: u16, pixel: impl Fn(u16, u16) -> [u16; 3]) -> Vec<u8>
     let long = |value: u32| (4_u16, 1_u32, value.to_le_bytes().to_vec());
     let pixels: Vec<u8> = (0..height)
         .flat_map(|y| (0..width).map(move |x| (x, y)))
-        .flat_map(|(x, y)| pixel(x, y))
+        .flat_map(|(x, y)| match is_mosaic {
+            true => vec![pixel(x, y)[usize::from(x % 2 + y % 2)]],
+            false => pixel(x, y).to_vec(),
+        })
         .flat_map(u16::to_le_bytes)
         .collect();
     // From XYZ to the camera's colours, which are sRGB's.
     let matrix = [32405, -15371, -4985, -9693, 18760, 416, 556, -2040, 10572].map(|v| [v, 10_000]);
+    let samples = if is_mosaic { 1 } else { 3 };
     let mut entries = vec![
         (254, long(0)),
         (256, long(width.into())),
         (257, long(height.into())),
-        (258, short(&[16; 3])),
+        (258, short(&[16; 3][..samples])),
         (259, short(&[1])),
-        (262, short(&[34892])),
+        (262, short(&[if is_mosaic { 32803 } else { 34892 }])),
         (271, text("Test")),
         (272, text("Linear")),
         (273, long(8)),
         (274, short(&[1])),
-        (277, short(&[3])),
+        (277, short(&[samples as u16])),
         (278, long(height.into())),
         (279, long(pixels.len() as u32)),
         (284, short(&[1])),
         (50706, bytes(&[1, 4, 0, 0])),
         (50707, bytes(&[1, 1, 0, 0])),
         (50708, text("Test Linear")),
-        (50714, short(&[BLACK; 3])),
-        (50717, short(&[WHITE; 3])),
+        (50714, short(&[BLACK; 3][..samples])),
+        (50717, short(&[WHITE; 3][..samples])),
         (50721, rational(10, &matrix)),
         (50728, rational(5, &[[1, 2], [1, 1], [2, 3]])),
         (50778, short(&[21])),
     ];
+    if is_mosaic {
+        entries.extend([(33421, short(&[2, 2])), (33422, bytes(&[0, 1, 1, 2]))]);
+    }
     entries.sort_by_key(|(tag, _)| *tag);
     let directory = 8 + pixels.len();
     let mut after = directory + 2 + 12 * entries.len() + 4;
@@ -121,6 +140,91 @@ fn a_linear_dng_is_linear_light_with_the_cameras_white() {
     let other = Image::load(&exr).unwrap();
     let off = image.data.iter().zip(&other.data).map(|(a, b)| (a - b).abs());
     assert!(off.fold(0.0, f32::max) < 1e-5);
+}
+
+/// A signal of a part of the noise, in a set of views: its mean, over all pixels, in standard deviations of the noise.
+/// Cut at black, it would be .40 for no light, and .08 too much for light of one standard deviation.
+#[test]
+fn noise_at_black_keeps_its_mean_through_loading_and_the_target() {
+    const VIEWS: usize = 30;
+    const SIGMA: f32 = 16.0;
+    let (folder, gpu) = (Folder::empty(), gpu());
+    let path = folder.join("a.dng");
+    let mut random = Random::new(3);
+    let none = ToneSettings::new(ToneCurve::None);
+    let auto = ToneSettings::default();
+    let curves = [&none, &auto].map(|settings| PseudoGt::new(&gpu, settings).unwrap());
+    let lit = [MeasuredPhotograph::measure(&[0.1; 300])];
+    let law = SceneTone::from_photographs(&auto, &lit).unwrap().mapping_of(&lit[0]);
+    let plain = SceneTone::new(&none).mapping_of(&lit[0]);
+    let sigma = SIGMA / f32::from(WHITE - BLACK);
+    for is_mosaic in [false, true] {
+        for signal in [0.0, 0.25, 0.5, 1.0, 2.0] {
+            let (mut loaded, mut targets, mut bright) = ([0.0; 3], [0.0; 3], [0.0; 3]);
+            for _ in 0..VIEWS {
+                let noisy = |_, _| {
+                    let noise: [f64; 3] = random.normals();
+                    noise.map(|noise| {
+                        (f32::from(BLACK) + SIGMA * (signal + noise as f32)).round() as u16
+                    })
+                };
+                fs::write(&path, dng_of(16, 16, is_mosaic, noisy)).unwrap();
+                let image = Image::load(&path).unwrap();
+                let target = curves[0].tone_mapped(&image, &plain).unwrap();
+                let brightened = curves[1].tone_mapped(&image, &law).unwrap();
+                let black = law.parameters.offset;
+                for channel in 0..3 {
+                    let mean = |values: &[f32], value: fn(f32) -> f32| {
+                        let values = &values[256 * channel..][..256];
+                        values.iter().map(|&x| f64::from(value(x))).sum::<f64>() / 256.0
+                    };
+                    let unit = f64::from(sigma / NEUTRAL[channel]) * VIEWS as f64;
+                    loaded[channel] += mean(&image.data, linear_from_srgb) / unit;
+                    targets[channel] += mean(&target.data, linear_from_srgb) / unit;
+                    bright[channel] += mean(&brightened.data, |x| x) - f64::from(black);
+                }
+            }
+            // Demosaicing repeats a sample up to four times, in both directions.
+            let repeats = if is_mosaic { 4.0 } else { 1.0 };
+            let error = 4.0 * repeats / (VIEWS as f64 * 256.0).sqrt();
+            println!(
+                "mosaic {is_mosaic}, signal {signal}: {loaded:.3?} {targets:.3?} {bright:.4?}"
+            );
+            for found in loaded.into_iter().chain(targets) {
+                assert!((found - f64::from(signal)).abs() < error, "{signal}: {found}");
+            }
+            // By the slope at black, which the curve has on both sides.
+            let slope = 12.92 * (1.0 - 0.075) / law.parameters.white;
+            for (channel, found) in bright.into_iter().enumerate() {
+                let one = f64::from(slope * sigma / NEUTRAL[channel]);
+                let found = found / VIEWS as f64 / one;
+                assert!(signal > 0.0 || found.abs() < error, "{channel}: {found}");
+            }
+        }
+    }
+}
+
+/// Below white, light comes back, also beyond white of another channel; a pixel with a channel at the sensor's white is
+/// limited to the smallest white of a channel after white balance.
+#[test]
+fn highlights_keep_their_light_up_to_the_sensors_white_and_are_white_there() {
+    let folder = Folder::empty();
+    let path = folder.join("a.dng");
+    let cases: [([f32; 3], [f32; 3]); 6] = [
+        ([0.9; 3], [0.9; 3]),
+        ([1.5, 0.8, 0.3], [1.5, 0.8, 0.3]),
+        ([0.2, 0.5, 1.2], [0.2, 0.5, 1.2]),
+        ([2.0, 1.0, 1.5], [1.0; 3]),
+        ([1.2, 1.0, 1.5], [1.0; 3]),
+        ([2.0, 0.4, 0.2], [1.0, 0.4, 0.2]),
+    ];
+    for (planted, expected) in cases {
+        fs::write(&path, dng(16, 8, |_, _| counted(planted))).unwrap();
+        let found = Image::load(&path).unwrap().pixel(7, 3).map(linear_from_srgb);
+        for (found, expected) in found.into_iter().zip(expected) {
+            assert!((found - expected).abs() < 1e-3, "{planted:?}: {found}, not {expected}");
+        }
+    }
 }
 
 #[test]

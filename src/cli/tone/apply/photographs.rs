@@ -10,8 +10,11 @@ use crate::base::tree;
 use crate::cli::OutputFormat;
 use crate::photographs::dataset::{Borders, Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
-use crate::photographs::image::{ColourCounts, Image, Mask, MaskFile, Orientation, PictureFile};
-use crate::photographs::white_balance::{WhiteBalance, WhiteBalanceGains};
+use crate::photographs::image::{
+    ColourCounts, Image, Levels, Mask, MaskFile, Orientation, PictureFile,
+};
+use crate::photographs::white_balance::WhiteBalanceGains;
+use crate::train::TrainConfig;
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -27,6 +30,8 @@ pub(super) struct InputPhotograph {
     /// The file to write.
     pub(super) target: Option<PathBuf>,
     pub(super) gains: Option<WhiteBalanceGains>,
+    /// The levels of the set.
+    pub(super) levels: Levels,
     /// What the photographs of a dataset do not show at their borders.
     pub(super) borders: Arc<Borders>,
 }
@@ -69,10 +74,7 @@ impl InputPhotograph {
 }
 
 /// The photographs of the input: a file, those of a folder by name, or those of a dataset.
-pub(super) fn listed(
-    args: &ApplyArgs,
-    balance: Option<&WhiteBalance>,
-) -> Result<Vec<InputPhotograph>> {
+pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<InputPhotograph>> {
     let input = &args.input;
     let unreadable =
         |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));
@@ -91,6 +93,7 @@ pub(super) fn listed(
             split: Some(split),
             target: None,
             gains: None,
+            levels: Levels::default(),
             borders: borders.clone(),
         };
         of_dataset.into_iter().map(of_view).collect()
@@ -105,8 +108,15 @@ pub(super) fn listed(
         return Err(Error::input(input, "contains no PNG, JPEG, WebP, TIFF or EXR image"));
     }
     let named = || photographs.iter().map(|one| (one.name.as_str(), one.input.as_path()));
-    let gains = balance.map(|balance| balance.gains(input, named())).transpose()?;
-    photographs.iter_mut().for_each(|photograph| photograph.gains = gains);
+    let training = photographs.iter().filter(|one| one.split != Some(Split::Test));
+    let training: Vec<&Path> = training.map(|one| one.input.as_path()).collect();
+    let levels = Levels::of_all(config.light, &training);
+    levels.say();
+    let balance = config.white_balance.as_ref();
+    let gains = balance.map(|balance| balance.gains(input, named(), levels)).transpose()?;
+    for photograph in &mut photographs {
+        (photograph.gains, photograph.levels) = (gains, levels);
+    }
     if let Some(out) = &args.out {
         set_targets(&mut photographs, out, args.format)?;
     }
@@ -139,6 +149,7 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<InputPhotograph> {
         mask,
         target: None,
         gains: None,
+        levels: Levels::default(),
         borders,
     })
 }

@@ -1,8 +1,13 @@
-//! Reports the colours of a set of photographs: one line for each colour space, not for each file.
+//! Reports the colours of a set of photographs, which share their levels: one line for each colour space, not for each
+//! file.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
+use super::super::Image;
+use super::super::decoded::DecodedImage;
+use super::super::levels::Levels;
 use super::Conversion;
 
 /// Counts conversions, thread-safe.
@@ -10,6 +15,8 @@ use super::Conversion;
 pub(crate) struct ColourCounts {
     /// The name of the counted items, in the singular.
     what: &'static str,
+    /// With which all of them are decoded.
+    levels: Levels,
     counts: Mutex<Counts>,
 }
 
@@ -25,6 +32,10 @@ struct Counts {
     converted: BTreeMap<String, (usize, f64)>,
     /// By the metadata that cannot be used.
     unknown: BTreeMap<String, usize>,
+    /// What is unusual about the values of a file.
+    remarks: BTreeSet<String>,
+    /// A value was beyond the levels.
+    is_beyond: bool,
 }
 
 /// The fraction of pixels outside sRGB that is worth a warning.
@@ -33,11 +44,41 @@ const SMALL: f64 = 0.01;
 impl ColourCounts {
     /// For items of this name.
     pub(crate) fn new(what: &'static str) -> Self {
-        Self { what, counts: Mutex::default() }
+        Self { what, levels: Levels::default(), counts: Mutex::default() }
     }
 
-    /// Counts a photograph.
-    pub(crate) fn add(&self, conversion: Conversion) {
+    /// For photographs of these levels.
+    pub(crate) fn of_levels(levels: Levels) -> Self {
+        Self { levels, ..Self::default() }
+    }
+
+    /// The levels.
+    pub(crate) fn levels(&self) -> Levels {
+        self.levels
+    }
+
+    /// Whether a value was beyond the levels: they are not those of the set.
+    pub(crate) fn is_beyond(&self) -> bool {
+        self.counts.lock().unwrap_or_else(PoisonError::into_inner).is_beyond
+    }
+
+    /// Counts a photograph; returns its pixels and alpha.
+    pub(in super::super) fn add(
+        &self,
+        path: &Path,
+        decoded: DecodedImage,
+    ) -> (Image, Option<Image>) {
+        let DecodedImage { image, alpha, conversion, is_beyond, remark, .. } = decoded;
+        let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
+        counts.is_beyond |= is_beyond;
+        counts.remarks.extend(remark.map(|remark| format!("{}: {remark}", path.display())));
+        drop(counts);
+        self.count(conversion);
+        (image, alpha)
+    }
+
+    /// Counts a conversion.
+    pub(super) fn count(&self, conversion: Conversion) {
         let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((space, outside)) = conversion.from {
             let (count, sum) = counts.converted.entry(space).or_default();
@@ -58,7 +99,7 @@ impl ColourCounts {
         let counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
         let these =
             |count: usize| format!("{count} {}{}", self.what, if count == 1 { "" } else { "s" });
-        let mut lines = vec![];
+        let mut lines: Vec<String> = counts.remarks.iter().cloned().collect();
         for (space, &(count, sum)) in &counts.converted {
             let (whose, outside) = (these(count), sum / count as f64);
             lines.push(format!("{whose} in {space} converted to sRGB"));

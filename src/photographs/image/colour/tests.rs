@@ -317,7 +317,7 @@ fn many_files_are_reported_in_a_line_for_each_colour_space() {
     ] {
         for _ in 0..count {
             let from = from.map(|(name, outside): (&str, f64)| (name.to_owned(), outside));
-            counters.add(Conversion { from, unknown: unknown.map(str::to_owned) });
+            counters.count(Conversion { from, unknown: unknown.map(str::to_owned) });
         }
     }
     let lines = counters.lines();
