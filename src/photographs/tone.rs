@@ -46,9 +46,9 @@ pub(crate) use self::curve::{Curve, Variable};
 #[cfg(feature = "io")]
 pub(crate) use self::curve::{clamped, curve_at, tone_curve};
 #[cfg(feature = "io")]
-pub(crate) use self::exposure::all_black;
-#[cfg(feature = "io")]
 pub use self::exposure::{Exposure, exposure_knots, is_black, soft};
+#[cfg(feature = "io")]
+pub(crate) use self::exposure::{MAX_GAIN, all_black};
 pub use self::families::{Constant, FAMILIES, Family, ToneCurve, White};
 #[cfg(feature = "io")]
 pub use self::file::CurveChoice;

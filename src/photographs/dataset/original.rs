@@ -28,6 +28,8 @@ pub struct Original {
     orientation: Orientation,
     /// White balance of a photograph.
     pub(super) gains: Option<WhiteBalanceGains>,
+    /// As [`super::LoadOptions::falloff`], of a photograph.
+    pub(super) falloff: Option<[f64; 2]>,
     /// The statistics of the photograph, and the size they were measured at.
     pub(super) measured: Option<(MeasuredSize, MeasuredPhotograph)>,
     /// The checksum of the pixels as loaded, if they are not kept.
@@ -44,6 +46,7 @@ impl Original {
             undistort,
             orientation: turns.loading,
             gains: None,
+            falloff: None,
             measured: None,
             checksum: None,
             stored: Arc::default(),
@@ -77,7 +80,8 @@ impl Original {
         if let Some(gains) = self.gains {
             gains.apply(&mut image);
         }
-        preparation.loaded(image.turned(self.orientation), path)
+        let image = preparation.photograph(image.turned(self.orientation), path, self.falloff)?;
+        Ok(preparation.shrunk(image))
     }
 
     /// The statistics at a size, if they were measured while the photograph was decoded.

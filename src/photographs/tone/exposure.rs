@@ -35,7 +35,10 @@ const CUBIC_MEAN: f64 = 0.90;
 const MEANS: [f64; 2] = [0.44, 0.54];
 
 /// Minimum and maximum of the gain.
-const GAINS: [f64; 2] = [1e-3, 128.0];
+const GAINS: [f64; 2] = [1e-3, MAX_GAIN];
+
+/// The largest gain.
+pub(crate) const MAX_GAIN: f64 = 128.0;
 
 /// The minimum weight of a view's own gain if cameras are unknown.
 const MIN_SHARE: f64 = 0.75;
