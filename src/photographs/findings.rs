@@ -137,7 +137,7 @@ fn mixed(lit: &[&MeasuredPhotograph]) -> Option<String> {
     let (count, share) = MIN_KIND;
     (bright.min(dark) as f64 >= (share * lit.len() as f64).max(count as f64)).then(|| {
         format!(
-            "{bright} of {} photographs are in normal light and {dark} are dark; the dark ones are lifted to them: \
+            "{bright} of {} photographs are in normal light and {dark} are dark; the dark ones are brightened to them: \
              `exclude` leaves photographs out",
             lit.len()
         )
@@ -198,7 +198,10 @@ mod tests {
     #[test]
     fn a_raised_black_and_a_narrow_range_are_found() {
         let text = found(&[ramp(16.0 / 255.0, 0.3), ramp(17.0 / 255.0, 0.2)]);
-        assert!(text.starts_with("black is raised: no photograph is darker than 16 of 255"), "{text}");
+        assert!(
+            text.starts_with("black is raised: no photograph is darker than 16 of 255"),
+            "{text}"
+        );
         assert_eq!(found(&[ramp(16.0 / 255.0, 0.3), ramp(0.0, 0.3)]), "");
         let text = found(&vec![ramp(0.427, 0.458); 3]);
         assert!(text.contains("3.1 % of the scale, 0.427 to 0.458: stretch"), "{text}");
@@ -234,9 +237,8 @@ mod tests {
 
     #[test]
     fn pixels_that_the_curve_brings_near_white_are_counted() {
-        let exposure = |brightness| {
-            Exposure::measure([&ramp(0.0, 0.5).luminance], Some(brightness)).unwrap()
-        };
+        let exposure =
+            |brightness| Exposure::measure([&ramp(0.0, 0.5).luminance], Some(brightness)).unwrap();
         let all = [ramp(0.0, 0.5), photograph(&[(1.0, 1000)])];
         let share = brought_near_white(&all[..1], &exposure(0.6));
         let white = (0..1000).filter(|&index| {

@@ -164,19 +164,19 @@ impl Diagnosis {
     /// Loads a dataset and diagnoses its training photographs, as stored, while they are decoded. Where the corners of
     /// a lens are dark, and `options` do not say its fall-off, the photographs are loaded again without it.
     pub fn load(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
-        let (dataset, diagnosis) = Self::load_as_said(root, options)?;
+        let (dataset, diagnosis) = Self::load_with(root, options)?;
         let found = diagnosis.scene.falloff.filter(FalloffDiagnosis::is_found);
         let Some(found) = found.filter(|_| options.falloff.is_none()) else {
             return Ok((dataset, diagnosis));
         };
         drop(dataset);
         let options = LoadOptions { falloff: Some(found.falloff), ..options.clone() };
-        let (dataset, mut diagnosis) = Self::load_as_said(root, &options)?;
+        let (dataset, mut diagnosis) = Self::load_with(root, &options)?;
         diagnosis.scene.falloff = Some(FalloffDiagnosis { is_corrected: true, ..found });
         Ok((dataset, diagnosis))
     }
 
-    fn load_as_said(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
+    fn load_with(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
         let looked_at = Mutex::new(HashMap::new());
         let observe = |name: &str, image: &Image, mask: Option<&Mask>| {
             let photograph = PhotographStatistics::new(image, mask);
