@@ -7,6 +7,7 @@
 //! - [`metrics`]: PSNR and SSIM of a render against its reference image
 //! - [`tone`]: curves that brighten a photograph
 //! - [`fit`]: the constants of a curve from pairs of photographs
+//! - [`findings`]: what is odd about the brightness of a set, in sentences
 //! - [`dataset`]: photographs with their cameras and points, from disk
 //! - [`pseudo_gt`]: dark photograph and curve to target, on the device
 //! - [`targets`]: the curve of every view of a scene, and its target
@@ -15,6 +16,8 @@
 
 #[cfg(feature = "io")]
 pub mod dataset;
+#[cfg(feature = "io")]
+pub mod findings;
 #[cfg(feature = "cli")]
 pub mod fit;
 pub mod image;

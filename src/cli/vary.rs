@@ -70,6 +70,7 @@ pub fn run(args: &VaryArgs) -> anyhow::Result<()> {
         downscale: *downscale,
         test_every: *test_every,
         mask_borders: false,
+        mask_overlays: false,
         undistort: true,
         ..LoadOptions::default()
     };

@@ -55,11 +55,15 @@ pub use self::families::{Constant, FAMILIES, Family, ToneCurve, White};
 #[cfg(feature = "io")]
 pub use self::file::CurveChoice;
 #[cfg(feature = "io")]
+pub(crate) use self::histogram::EMPTY_CHANNEL;
+#[cfg(feature = "io")]
 pub use self::histogram::LuminanceHistogram;
 #[cfg(feature = "io")]
 pub use self::inverse::{InverseTone, Inverted};
 #[cfg(feature = "io")]
 pub use self::mapping::{MeasuredPhotograph, ToneMapping};
+#[cfg(feature = "io")]
+pub(crate) use self::metering::MAX_GAIN;
 #[cfg(feature = "io")]
 pub use self::metering::{CurveEnds, NEAR_WHITE, soft};
 #[cfg(feature = "check")]

@@ -43,7 +43,12 @@ const MEASURES: [Measure; 14] = [
         "stops brighter than other views of the same points",
         "beyond 0.3 either way: learn exposures",
     ),
-    ("white %", 2, "clipped values, %", "above 5: detail is lost in lamps or sky"),
+    (
+        "white %",
+        2,
+        "values near white, 0.94 and above, %",
+        "above 5: detail is lost in lamps or sky",
+    ),
     ("black %", 1, "zero values, %", "above 20: detail is lost in the shadows"),
     ("codes", 0, "distinct values in use, of 256 for 8 bits", "below 20: banding in the targets"),
     (
@@ -93,7 +98,7 @@ fn values(view: &ViewDiagnosis) -> [Option<f64>; 14] {
         Some(view.mean_luminance),
         Some(view.cubic_mean),
         view.exposure,
-        Some(100.0 * view.clipped_fraction),
+        Some(100.0 * view.near_white_fraction),
         Some(100.0 * view.zero_fraction),
         Some(view.code_values as f64),
         view.noise_in_target.map(|noise| noise.luma),
@@ -143,9 +148,9 @@ pub(crate) fn scene_facts(scene: &SceneDiagnosis) -> [[String; 2]; 6] {
     );
     let blur = scene.blur.map_or_else(|| "-".to_owned(), |blur| format!("{blur:.1} pixels"));
     let detail = format!(
-        "blur {blur}, {:.0} code values, {:.2} % white, {:.1} % black",
+        "blur {blur}, {:.0} code values, {:.2} % near white, {:.1} % black",
         scene.code_values,
-        100.0 * scene.clipped_fraction,
+        100.0 * scene.near_white_fraction,
         100.0 * scene.zero_fraction
     );
     let cameras = format!(

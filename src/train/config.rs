@@ -102,11 +102,19 @@ pub struct TrainConfig {
     /// range, and in float files a unit of their own.
     light: Option<StoredLight> = None, "srgb, and levels that the values show"
         => Rule::OneOf(&StoredLight::NAMES), "--light LIGHT";
+    /// Mask what hardly changes between views that move, such as a date burnt into every photograph, with the black bar
+    /// around it.
+    mask_overlays: bool = true => Rule::Flag;
     /// White balance of the photographs before they are measured: gains R,G,B of linear light; the colour temperature
     /// of the light in kelvin; VIEW,x,y,w,h, a neutral area of one photograph in pixels as stored; or
     /// VIEW,x1,y1,..,x4,y4, the corners of a chart of 24 patches: at the dark skin, bluish green, black and white
     /// patch.
     white_balance: Option<WhiteBalance> = None, "none" => WHITE_BALANCE, "--white-balance WHITE";
+    /// The fall-off of the lens: with u = 1 - cos of the angle off the axis, the light of the photographs is multiplied
+    /// by exp(falloff u), and by the square of u as well; 0: left as it is.
+    falloff: Option<f64> = None, "found from the points where corners are dark" => Rule::from_to(0.0, 1000.0);
+    /// The part of the fall-off with the square of u.
+    falloff_squared: f64 = 0.0 => Rule::from_to(-1000.0, 1000.0);
     /// Undistort fisheye photographs to pinhole ones, cropped to 60 degrees off the axis, instead of training with the
     /// fisheye model; other distorted photographs are always undistorted.
     undistort: bool = false => Rule::Flag, "--undistort";
@@ -317,7 +325,9 @@ impl TrainConfig {
             invert_masks: self.invert_masks,
             mask_borders: self.mask_borders,
             light: self.light,
+            mask_overlays: self.mask_overlays,
             white_balance: self.white_balance.clone(),
+            falloff: self.falloff.map(|falloff| [falloff, self.falloff_squared]),
             undistort: self.undistort,
             measured: match &self.tone {
                 ToneSettings { law: Some(_), .. } => MeasuredSize::None,

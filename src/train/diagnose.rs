@@ -25,6 +25,7 @@ use serde::Serialize;
 
 use crate::camera::Camera;
 use crate::photographs::dataset::{self, Borders, Dataset, LoadOptions, Split, View};
+use crate::photographs::findings::{brought_near_white, findings};
 use crate::photographs::image::{
     ColourCounts, Image, Levels, MIDDLE_GREY, Mask, PictureFile, files,
 };
@@ -34,7 +35,8 @@ use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 use geometry::SceneGeometry;
 pub(super) use geometry::exposures_at_points;
-pub use lamp::LampDiagnosis;
+pub use lamp::{LampDiagnosis, falloff::FalloffDiagnosis};
+use lamp::{LampObservations, bands};
 pub use noise::ChannelNoise;
 use photograph::PhotographStatistics;
 pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
@@ -66,8 +68,8 @@ pub struct ViewDiagnosis {
     pub darkening: f64,
     /// Its exposure relative to the others at shared points, in stops, with mean 0; `None` if it shares too few.
     pub exposure: Option<f64>,
-    /// The fraction of the values that are 1 or more.
-    pub clipped_fraction: f64,
+    /// The fraction of the values that are near white, 0.94 or more.
+    pub near_white_fraction: f64,
     /// The fraction of the values that are 0.
     pub zero_fraction: f64,
     /// The number of different values.
@@ -111,7 +113,7 @@ pub struct SceneDiagnosis {
     pub spread_is_measured: bool,
     /// The fraction of a view's exposure that its own gain compensates.
     pub exposure_share: f64,
-    pub clipped_fraction: f64,
+    pub near_white_fraction: f64,
     pub zero_fraction: f64,
     pub code_values: f64,
     /// Fitted to the patches of all views.
@@ -133,6 +135,8 @@ pub struct SceneDiagnosis {
     /// Why they do not.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lamp_unknown: Option<String>,
+    /// The fall-off of the lens, before it was corrected; `None` if the points do not show it.
+    pub falloff: Option<FalloffDiagnosis>,
 }
 
 /// The diagnosis of a capture.
@@ -159,8 +163,22 @@ pub struct Diagnosis {
 }
 
 impl Diagnosis {
-    /// Loads a dataset and diagnoses its training photographs, as stored, while they are decoded.
+    /// Loads a dataset and diagnoses its training photographs, as stored, while they are decoded. Where the corners of
+    /// a lens are dark, and `options` do not say its fall-off, the photographs are loaded again without it.
     pub fn load(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
+        let (dataset, diagnosis) = Self::load_with(root, options)?;
+        let found = diagnosis.scene.falloff.filter(FalloffDiagnosis::is_found);
+        let Some(found) = found.filter(|_| options.falloff.is_none()) else {
+            return Ok((dataset, diagnosis));
+        };
+        drop(dataset);
+        let options = LoadOptions { falloff: Some(found.falloff), ..options.clone() };
+        let (dataset, mut diagnosis) = Self::load_with(root, &options)?;
+        diagnosis.scene.falloff = Some(FalloffDiagnosis { is_corrected: true, ..found });
+        Ok((dataset, diagnosis))
+    }
+
+    fn load_with(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
         let looked_at = Mutex::new(HashMap::new());
         let observe = |name: &str, image: &Image, mask: Option<&Mask>| {
             let photograph = PhotographStatistics::new(image, mask);
@@ -214,9 +232,19 @@ impl Diagnosis {
         };
         let diagnosed: Vec<ViewDiagnosis> = photographs.iter().enumerate().map(of_view).collect();
         let without_pose = without_pose(&paths, &files, dataset)?;
-        let remarks = remarks(&diagnosed, &photographs, &views, &without_pose);
-        let mut scene =
-            SceneDiagnosis::new(&diagnosed, photographs, &shared, &exposure, dataset.points.len());
+        let mut remarks = remarks(&diagnosed, &photographs, &views, &without_pose);
+        let tracks = LampObservations::new(&shared.observations, views.len());
+        remarks.extend(tracks.as_ref().ok().and_then(bands::remark));
+        let near_white = brought_near_white(&measured, &exposure);
+        remarks.extend(findings(&measured, Some(&exposure), near_white));
+        let mut scene = SceneDiagnosis::new(
+            &diagnosed,
+            photographs,
+            &shared,
+            tracks,
+            &exposure,
+            dataset.points.len(),
+        );
         // A pixel of a resized target averages this many pixels in each direction.
         let shrink = diagnosed.iter().map(|view| options.shrink(view.size[0], view.size[1]));
         scene.target_noise /= shrink.fold(1.0, f64::max);
@@ -261,9 +289,9 @@ fn read(
     let named = || all.iter().map(|file| (file.name.as_str(), file.input.as_path()));
     let balance = options.white_balance.as_ref().filter(|_| !files.is_empty());
     let gains = balance.map(|balance| balance.gains(root, named(), levels)).transpose()?;
-    let borders = match options.mask_borders && !files.is_empty() {
-        true => Borders::of_photographs(all),
-        false => Borders::default(),
+    let borders = match files.is_empty() {
+        false => Borders::of_photographs(all, options),
+        true => Borders::default(),
     };
     let mut photographs = vec![];
     for files in files.chunks(Image::decoded_at_once(largest)) {
@@ -309,7 +337,7 @@ impl PhotographStatistics {
             light: self.light,
             darkening: darkening(self.light),
             exposure: shared.exposures[index],
-            clipped_fraction: self.clipped_fraction,
+            near_white_fraction: self.near_white_fraction,
             zero_fraction: self.zero_fraction,
             code_values: self.code_values,
             noise: self.noise,
@@ -328,6 +356,7 @@ impl SceneDiagnosis {
         views: &[ViewDiagnosis],
         photographs: Vec<PhotographStatistics>,
         shared: &SceneGeometry,
+        tracks: Result<LampObservations, String>,
         exposure: &Exposure,
         points: usize,
     ) -> Self {
@@ -337,7 +366,9 @@ impl SceneDiagnosis {
         let mean = |of: fn(&ViewDiagnosis) -> f64| {
             lit.iter().map(|view| of(view)).sum::<f64>() / lit.len().max(1) as f64
         };
-        let lamp = LampDiagnosis::new(&shared.observations, views.len());
+        let lamp = tracks.as_ref().map_err(Clone::clone).and_then(LampDiagnosis::new);
+        let falloff = tracks.ok().map(|tracks| FalloffDiagnosis::new(&tracks, shared.corner));
+        let is_lamp = lamp.as_ref().is_ok_and(LampDiagnosis::is_found);
         let measured = deviation(lit.iter().filter_map(|view| view.exposure));
         let light = mean(|view| view.light);
         Self {
@@ -353,7 +384,7 @@ impl SceneDiagnosis {
             exposure_spread: measured.unwrap_or(exposure.spread / std::f64::consts::LN_2),
             spread_is_measured: measured.is_some(),
             exposure_share: exposure.share,
-            clipped_fraction: mean(|view| view.clipped_fraction),
+            near_white_fraction: mean(|view| view.near_white_fraction),
             zero_fraction: mean(|view| view.zero_fraction),
             code_values: mean(|view| view.code_values as f64),
             noise,
@@ -366,6 +397,8 @@ impl SceneDiagnosis {
             points,
             lamp_unknown: lamp.as_ref().err().cloned(),
             lamp: lamp.ok(),
+            // A lamp's light falls as well.
+            falloff: falloff.filter(|_| !is_lamp),
         }
     }
 }

@@ -93,10 +93,14 @@ impl RequestedSettings {
         let _phase = tracing::info_span!("plan").entered();
         let config = self.settings(None)?.config()?;
         config.check()?;
-        let options = match planning {
+        let mut options = match planning {
             PlanSource::Nothing => config.load_options(),
             _ => diagnosed(&config),
         };
+        if let PlanSource::File(file) = planning {
+            let planned = Some(Plan::read(file)?.falloff).filter(|planned| planned.on);
+            options.falloff = options.falloff.or(planned.map(|planned| planned.falloff));
+        }
         let (mut dataset, plan) = if planning == PlanSource::Diagnosis {
             let (dataset, diagnosis) = Diagnosis::load(&config.dataset, &options)?;
             (dataset, Some(planned(&diagnosis, &config, gpu)))

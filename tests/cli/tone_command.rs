@@ -66,7 +66,7 @@ fn a_folder_is_mapped_by_name_and_unreadable_files_are_left_out() {
 }
 
 #[test]
-fn exr_is_not_rounded_and_clipping_is_counted() {
+fn exr_is_not_rounded_and_what_is_near_white_is_counted() {
     let dir = tempfile::tempdir().unwrap();
     let photograph = dir.path().join("one.png");
     let mut image = dark(10, 10);
@@ -84,10 +84,10 @@ fn exr_is_not_rounded_and_clipping_is_counted() {
     for (a, b) in mapped.data.iter().zip(&expected) {
         assert!((a - b).abs() < 1e-5, "{a}, not {b}");
     }
-    let clipped = expected.iter().filter(|&&y| y == 1.0).count();
-    assert!(clipped >= 30);
-    assert_eq!(views["one"].after.clipped_fraction, clipped as f64 / 300.0);
-    assert_eq!(views["one"].before.clipped_fraction, 0.1);
+    let near_white = expected.iter().filter(|&&y| y >= 0.94).count();
+    assert!(near_white >= 30);
+    assert_eq!(views["one"].after.near_white_fraction, near_white as f64 / 300.0);
+    assert_eq!(views["one"].before.near_white_fraction, 0.1);
 }
 
 #[test]
@@ -163,7 +163,7 @@ fn references_give_scores_and_the_page_shows_the_distributions() {
     }
     assert!(html.contains("<polyline") && html.contains("dB, SSIM"));
     let json = serde_json::to_value(&output).unwrap();
-    let keys = "p10 p90 r delta0 mean_luminance psnr ssim skewness clipped_fraction";
+    let keys = "p10 p90 r delta0 mean_luminance psnr ssim skewness near_white_fraction";
     for key in keys.split(' ') {
         assert!(json["scene"][key].is_number() && json["views"]["a"][key].is_number(), "{key}");
     }

@@ -8,6 +8,7 @@ mod common;
 mod curve_training;
 mod diagnose;
 mod few_points;
+mod findings;
 mod freeze;
 mod holes;
 mod lamp;

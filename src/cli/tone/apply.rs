@@ -16,11 +16,13 @@ use crate::cli::settings::{CurveOptions, Selection, SettingOptions};
 use crate::cli::{OutputFormat, driver, finish, progress_bar, table, word, words};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
+use crate::photographs::findings::findings;
 use crate::photographs::image::{ColourCounts, Image, Mask, Orientation};
 use crate::photographs::metrics::Scores;
 use crate::photographs::targets::{SceneTone, Targets};
 use crate::photographs::tone::{
-    CurveChoice, Exposure, MeasuredPhotograph, Statistics, Tone, ToneCurve, ToneSettings, all_black,
+    CurveChoice, Exposure, MeasuredPhotograph, NEAR_WHITE, Statistics, Tone, ToneCurve,
+    ToneSettings, all_black,
 };
 use crate::results::eval;
 use crate::results::report::Distribution;
@@ -110,8 +112,8 @@ pub struct Measures {
     pub mean_luminance: f64,
     /// Mean over all channels.
     pub mean: f64,
-    /// Fraction of values of all channels that are 1 or more.
-    pub clipped_fraction: f64,
+    /// Fraction of values of all channels that are 0.94 or more.
+    pub near_white_fraction: f64,
     /// Skewness of the luminance.
     pub skewness: f64,
 }
@@ -149,6 +151,9 @@ pub struct ToneOutput {
     pub exposure: Option<Exposure>,
     /// Means of statistics over training views and of scores over test views; without a split, over all.
     pub scene: ToneReport,
+    /// What is odd about the photographs, a sentence each.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub remarks: Vec<String>,
     /// Measurements by view.
     pub views: BTreeMap<String, ToneReport>,
 }
@@ -157,7 +162,7 @@ impl Measures {
     fn new(planes: &[f32], statistics: &Statistics) -> Self {
         let mut distribution = Distribution::new("");
         distribution.add(planes);
-        let clipped = planes.iter().filter(|&&value| value >= 1.0).count();
+        let near_white = planes.iter().filter(|&&value| f64::from(value) >= NEAR_WHITE).count();
         let [p10, p90] = statistics.percentiles();
         Self {
             p10,
@@ -165,7 +170,7 @@ impl Measures {
             r: statistics.printed_ratio(),
             mean_luminance: statistics.mean_luminance.into(),
             mean: statistics.mean.into(),
-            clipped_fraction: clipped as f64 / planes.len().max(1) as f64,
+            near_white_fraction: near_white as f64 / planes.len().max(1) as f64,
             skewness: distribution.skewness(),
         }
     }
@@ -178,7 +183,7 @@ impl Measures {
             r: mean(|one| one.r),
             mean_luminance: mean(|one| one.mean_luminance),
             mean: mean(|one| one.mean),
-            clipped_fraction: mean(|one| one.clipped_fraction),
+            near_white_fraction: mean(|one| one.near_white_fraction),
             skewness: mean(|one| one.skewness),
         }
     }
@@ -207,8 +212,8 @@ pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
 }
 
 fn text_table(output: &ToneOutput) -> String {
-    let heading = "name p10 p90 r delta0 Y skewness -> Y skewness clipped PSNR SSIM";
-    let mut rows = vec![heading.split(' ').map(str::to_owned).collect::<Vec<_>>()];
+    let heading = "name p10 p90 r delta0 Y skewness -> Y skewness near_white PSNR SSIM";
+    let mut rows = vec![heading.split(' ').map(|name| name.replace('_', " ")).collect::<Vec<_>>()];
     let views = output.views.iter().map(|(name, report)| (name.as_str(), report));
     for (name, report) in views.chain([("scene", &output.scene)]) {
         let ToneReport { before, delta0, after, scores, .. } = report;
@@ -225,15 +230,16 @@ fn text_table(output: &ToneOutput) -> String {
             String::new(),
             format!("{:.4}", after.mean_luminance),
             format!("{:.2}", after.skewness),
-            format!("{:.1} %", 100.0 * after.clipped_fraction),
+            format!("{:.1} %", 100.0 * after.near_white_fraction),
             score(|scores| format!("{:.2}", scores.psnr)),
             score(|scores| format!("{:.3}", scores.ssim)),
         ]);
     }
+    let remarks: String = output.remarks.iter().map(|remark| format!("note: {remark}\n")).collect();
     let reason = output.exposure.as_ref().map(|exposure| format!("{}\n", exposure.reason()));
     let label = output.with_reference.as_deref().map(eval::with_reference);
     let label = label.map(|line| line + "\n").unwrap_or_default();
-    reason.unwrap_or_default() + &table::aligned(&rows) + &label
+    reason.unwrap_or_default() + &table::aligned(&rows) + &remarks + &label
 }
 
 /// Maps every photograph and writes it to `args.out` under its own name. Of several photographs, unusable ones are
@@ -284,7 +290,9 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     let views = views.into_iter().map(|(listed, report)| (listed.name.clone(), report)).collect();
     scene.gain = exposure.as_ref().map(|exposure| exposure.gain);
     let with_reference = settings.knows_references();
-    let output = ToneOutput { curve: settings, with_reference, exposure, scene, views };
+    let near_white = scene.after.near_white_fraction - scene.before.near_white_fraction;
+    let remarks = findings(&set.measured, exposure.as_ref(), near_white);
+    let output = ToneOutput { curve: settings, with_reference, exposure, scene, remarks, views };
     if let (Some(page), Some(path)) = (page, &args.report) {
         page.write(path, &output)?;
     }
@@ -298,6 +306,8 @@ struct CurveOnSet {
     inverted: bool,
     /// Counts of converted and unsupported colours, of photographs and of references.
     colours: [ColourCounts; 2],
+    /// Those that are not for tests, as they were mapped.
+    measured: Vec<MeasuredPhotograph>,
 }
 
 impl CurveOnSet {
@@ -332,6 +342,7 @@ impl CurveOnSet {
             targets: Targets::in_scene(gpu, scene)?,
             inverted,
             colours: [ColourCounts::of_levels(levels), ColourCounts::new("reference image")],
+            measured: vec![],
         })
     }
 
@@ -340,10 +351,16 @@ impl CurveOnSet {
         &mut self,
         photograph: &Image,
         gaps: &[usize],
+        is_test: bool,
     ) -> Result<(Statistics, Image, Option<f64>)> {
         let measured = MeasuredPhotograph::measure(&without(photograph, gaps));
         let image = self.targets.tone_mapped(photograph, &measured)?;
-        Ok((measured.statistics, image, self.targets.scene.mapping_of(&measured).gain))
+        let gain = self.targets.scene.mapping_of(&measured).gain;
+        let statistics = measured.statistics;
+        if !is_test {
+            self.measured.push(measured);
+        }
+        Ok((statistics, image, gain))
     }
 }
 
@@ -379,7 +396,8 @@ fn mapped(set: &mut CurveOnSet, listed: &InputPhotograph) -> Result<Mapped> {
         Ok(if is_plain { image.turned(Orientation::from_file(path)) } else { image })
     };
     let reference = listed.reference.as_ref().map(load).transpose()?;
-    let (statistics, image, gain) = set.result(&photograph, &gaps)?;
+    let (statistics, image, gain) =
+        set.result(&photograph, &gaps, listed.split == Some(Split::Test))?;
     Ok(Mapped { photograph, gaps, statistics, image, gain, reference })
 }
 

@@ -1,13 +1,18 @@
-//! Black borders and corners outside the scene: blank areas of undistorted photographs, and bars.
+//! What all photographs of a size have at the same position, outside the scene: black borders and corners, as
+//! undistorting leaves them, and overlays.
 //!
 //! Such black touches the border, is at the same position in all views and ends abruptly, unlike the black of a dark
 //! scene.
 
+mod overlay;
+
+use std::cell::OnceCell;
 use std::collections::BTreeMap;
 
 use super::source::{ViewFiles, shown};
-use super::{Photograph, Split};
+use super::{LoadOptions, Photograph, Split};
 use crate::photographs::image::{Image, Mask, PictureFile};
+use overlay::Overlay;
 
 /// The maximum encoded value of black: JPEG turns 0 into up to this within a block.
 const BLACK: f32 = 1.5 / 255.0;
@@ -43,42 +48,44 @@ struct BorderCandidate<'a> {
 }
 
 impl Borders {
-    pub(super) fn of_sources<'a>(sources: impl Iterator<Item = &'a ViewFiles>) -> Self {
+    pub(super) fn of_sources<'a>(
+        sources: impl Iterator<Item = &'a ViewFiles>,
+        options: &LoadOptions,
+    ) -> Self {
         let sources =
             sources.filter(|source| source.split == Split::Train && source.mask.is_none());
-        Self::find(sources.map(|source| {
+        let candidates = sources.map(|source| {
             let size = source.read[0].as_ref().and_then(|file| file.size().ok());
             let size = size.or_else(|| Image::size_of(source.input.as_deref()?).ok());
             let picture = Box::new(|| source.picture());
             BorderCandidate { size: size.unwrap_or_default(), picture }
-        }))
+        });
+        Self::find(candidates, options)
     }
 
     /// Those of a dataset that is not loaded.
-    pub(crate) fn of_photographs(photographs: &[Photograph]) -> Self {
+    pub(crate) fn of_photographs(photographs: &[Photograph], options: &LoadOptions) -> Self {
         let training =
             photographs.iter().filter(|one| one.split == Split::Train && one.mask.is_none());
-        Self::find(training.map(|Photograph { input, .. }| {
+        let candidates = training.map(|Photograph { input, .. }| {
             let picture = Box::new(|| shown(PictureFile::open(input).ok()?));
             BorderCandidate { size: Image::size_of(input).unwrap_or_default(), picture }
-        }))
+        });
+        Self::find(candidates, options)
     }
 
-    fn find<'a>(candidates: impl Iterator<Item = BorderCandidate<'a>>) -> Self {
+    fn find<'a>(
+        candidates: impl Iterator<Item = BorderCandidate<'a>>,
+        options: &LoadOptions,
+    ) -> Self {
         let mut by_size: BTreeMap<(u32, u32), Vec<BorderCandidate<'_>>> = BTreeMap::new();
-        candidates.for_each(|one| by_size.entry(one.size).or_default().push(one));
+        if options.mask_borders || options.mask_overlays {
+            candidates.for_each(|one| by_size.entry(one.size).or_default().push(one));
+        }
         by_size.retain(|_, candidates| candidates.len() >= NEEDED);
         let found = by_size.into_iter().filter_map(|(size, candidates)| {
-            let step = candidates.len().div_ceil(LOOKED_AT);
-            let images = candidates.iter().step_by(step).filter_map(|one| (one.picture)());
-            let border = border(images, size)?;
-            let (width, height) = size;
-            tracing::warn!(
-                "{:.1} % of the photographs of {width}x{height} is black in the same place at the border, as \
-                 undistorting leaves it where the lens saw nothing: masked (mask_borders = false trains on it)",
-                100.0 * border.len() as f64 / f64::from(width) / f64::from(height)
-            );
-            Some((size, border))
+            let hidden = hidden(&candidates, size, options);
+            (!hidden.is_empty()).then_some((size, hidden))
         });
         Self(found.collect())
     }
@@ -89,18 +96,64 @@ impl Borders {
     }
 }
 
-/// The black border that images of one size have in common.
-fn border(images: impl Iterator<Item = Image>, (width, height): (u32, u32)) -> Option<Vec<usize>> {
+/// The pixels outside the scene in photographs of one size. Says what they are.
+fn hidden(
+    candidates: &[BorderCandidate<'_>],
+    (width, height): (u32, u32),
+    options: &LoadOptions,
+) -> Vec<usize> {
+    let grid = PixelGrid { width: width as usize, height: height as usize };
+    let step = candidates.len().div_ceil(LOOKED_AT);
+    let chosen: Vec<&BorderCandidate<'_>> = candidates.iter().step_by(step).collect();
+    let planes = vec![OnceCell::new(); chosen.len()];
+    let plane = |index: usize| {
+        let decoded = || {
+            let image = (chosen[index].picture)();
+            image.filter(|image| image.pixel_count() == grid.len()).map(|image| brightest(&image))
+        };
+        planes[index].get_or_init(decoded).as_deref()
+    };
+    let mut hidden = vec![];
+    if options.mask_borders
+        && let Some(border) = border((0..chosen.len()).filter_map(plane), (width, height))
+    {
+        tracing::warn!(
+            "{:.1} % of the photographs of {width}x{height} is black in the same place at the border, as \
+             undistorting leaves it where the lens saw nothing: masked (mask_borders = false trains on it)",
+            100.0 * border.len() as f64 / grid.len() as f64
+        );
+        hidden = border;
+    }
+    if options.mask_overlays {
+        for Overlay { rows, columns, .. } in overlay::overlays(chosen.len(), plane, &grid) {
+            tracing::warn!(
+                "rows {} to {}, columns {} to {} of the photographs of {width}x{height} hardly change between views \
+                 that move, like a date burnt into them: masked (masks/ can mask other pixels, mask_overlays = false \
+                 trains on these)",
+                rows.start,
+                rows.end - 1,
+                columns.start,
+                columns.end - 1
+            );
+            hidden.extend(rows.flat_map(|y| columns.clone().map(move |x| y * grid.width + x)));
+        }
+    }
+    hidden.sort_unstable();
+    hidden.dedup();
+    hidden
+}
+
+/// The black border that images of one size have in common; of each, the largest channel of every pixel.
+fn border<'a>(
+    views: impl Iterator<Item = &'a [f32]>,
+    (width, height): (u32, u32),
+) -> Option<Vec<usize>> {
     let plane = PixelGrid { width: width as usize, height: height as usize };
     let least = (LEAST_AREA * plane.len() as f64).ceil().max(1.0) as usize;
     let mut counts = vec![0_u16; plane.len()];
     let (mut brightness, mut areas) = (vec![], vec![]);
-    for image in images {
-        if image.pixel_count() != plane.len() {
-            return None;
-        }
-        let values = brightest(&image);
-        let black = plane.black_from_border(&values);
+    for values in views {
+        let black = plane.black_from_border(values);
         // What all views have the first has.
         if black.len() < least {
             return None;
@@ -250,6 +303,11 @@ mod tests {
                 [if is_seen { scene(x + shift * view, y + shift * view) } else { 0.0 }; 3]
             })
         })
+    }
+
+    fn border(images: impl Iterator<Item = Image>, size: (u32, u32)) -> Option<Vec<usize>> {
+        let planes: Vec<Vec<f32>> = images.map(|image| brightest(&image)).collect();
+        super::border(planes.iter().map(Vec::as_slice), size)
     }
 
     fn textured(x: u32, y: u32) -> f32 {

@@ -45,8 +45,13 @@ pub struct LoadOptions {
     pub mask_borders: bool,
     /// How integer files of the photographs store light; `None`: as sRGB, with the levels that their values show.
     pub light: Option<StoredLight>,
+    /// Mask what hardly changes between views that move, such as a date burnt into every photograph.
+    pub mask_overlays: bool,
     /// Gains of the channels of the photographs; reference images are unchanged.
     pub white_balance: Option<WhiteBalance>,
+    /// The fall-off of the lens: the light of the photographs is multiplied by exp(a u + b u^2), with u = 1 - cos of
+    /// the angle off the axis.
+    pub falloff: Option<[f64; 2]>,
     /// The size at which training photographs are measured while they are decoded, if they are not kept at that size.
     pub measured: MeasuredSize,
     /// Undistort photographs of a fisheye to a pinhole's, as for every other lens, instead of training with the fisheye
@@ -95,7 +100,9 @@ impl Default for LoadOptions {
             invert_masks: false,
             mask_borders: true,
             light: None,
+            mask_overlays: true,
             white_balance: None,
+            falloff: None,
             measured: MeasuredSize::default(),
             undistort: false,
             depth: DepthOptions::default(),

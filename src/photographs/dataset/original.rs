@@ -30,6 +30,8 @@ pub struct Original {
     pub(super) levels: Levels,
     /// White balance of a photograph.
     pub(super) gains: Option<WhiteBalanceGains>,
+    /// As [`super::LoadOptions::falloff`], of a photograph.
+    pub(super) falloff: Option<[f64; 2]>,
     /// The statistics of the photograph, and the size they were measured at.
     pub(super) measured: Option<(MeasuredSize, MeasuredPhotograph)>,
     /// The checksum of the pixels as loaded, if they are not kept.
@@ -47,6 +49,7 @@ impl Original {
             orientation: turns.loading,
             levels: Levels::default(),
             gains: None,
+            falloff: None,
             measured: None,
             checksum: None,
             stored: Arc::default(),
@@ -81,7 +84,8 @@ impl Original {
         if let Some(gains) = self.gains {
             gains.apply(&mut image);
         }
-        preparation.loaded(image.turned(self.orientation), path)
+        let image = preparation.photograph(image.turned(self.orientation), path, self.falloff)?;
+        Ok(preparation.shrunk(image))
     }
 
     /// The statistics at a size, if they were measured while the photograph was decoded.

@@ -107,10 +107,7 @@ fn load_with(
         }
     }
     let options = &resolved(&groups, options);
-    let borders = match options.mask_borders {
-        true => Borders::of_sources(groups.iter().flat_map(|(_, group)| group)),
-        false => Borders::default(),
-    };
+    let borders = Borders::of_sources(groups.iter().flat_map(|(_, group)| group), options);
     let largest = groups.iter().map(|(lens, _)| pixel_count((lens.width, lens.height))).max();
     let at_once = Image::decoded_at_once(largest.unwrap_or_default());
     let originals = Allowance::new(bytes_for_originals(&groups, options));
@@ -417,14 +414,14 @@ impl ViewLoader<'_> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
         let DecodedPicture { path, image, turns, .. } = decoded;
-        let whole = preparation.whole(image.turned(turns.loading), &path)?;
+        let whole = preparation.photograph(image.turned(turns.loading), &path, options.falloff)?;
         let is_shrunk = preparation.size != (whole.width, whole.height);
         let is_kept = options.keep != Some(0);
         if is_kept && !is_shrunk {
             return Ok((Some(whole), None));
         }
         let mut original = Original::new(path, *preparation.lens, options.undistort, turns);
-        original.gains = loading.gains;
+        (original.gains, original.falloff) = (loading.gains, options.falloff);
         original.levels = loading.colours[0].levels();
         let measured = |image: &Image| match mask {
             Some(mask) => MeasuredPhotograph::measure(&mask.counted(image)),

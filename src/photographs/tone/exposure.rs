@@ -18,7 +18,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::histogram::LuminanceHistogram;
-use super::metering::{CurveEnds, GAINS, Metering, gain_at, mean_of_soft};
+use super::metering::{CurveEnds, MAX_GAIN, Metering, gain_at, mean_of_soft};
 use crate::camera::{Camera, CameraPoses};
 
 /// The minimum weight of a view's own gain if cameras are unknown.
@@ -230,7 +230,7 @@ impl Exposure {
         let brightening = self.brightening();
         let verdict = match self.weight() {
             0.0 => "well lit, no curve".to_owned(),
-            1.0 if *gain > 0.999 * GAINS[1] => format!(
+            1.0 if *gain > 0.999 * MAX_GAIN => format!(
                 "gain {gain:.1}, its limit (if 16-bit files hold linear light, say `--light linear`)"
             ),
             1.0 => format!("gain {gain:.1}"),

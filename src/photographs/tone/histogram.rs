@@ -27,7 +27,7 @@ pub struct LuminanceHistogram {
 }
 
 /// A channel whose sum is less than this fraction of the largest is empty.
-const EMPTY_CHANNEL: f64 = 0.01;
+pub(crate) const EMPTY_CHANNEL: f64 = 0.03;
 
 /// For each channel itself, or the brightest one if it is empty: an image intensifier fills green alone.
 fn filled_channels(planes: [&[f32]; 3]) -> [usize; 3] {

@@ -40,7 +40,8 @@ const MEANS: [f64; 2] = [0.42, 0.54];
 const MIDDLE_GREY: f64 = 0.46;
 
 /// Minimum and maximum of the gain.
-pub(super) const GAINS: [f64; 2] = [1e-3, 128.0];
+pub(super) const GAINS: [f64; 2] = [1e-3, MAX_GAIN];
+pub(crate) const MAX_GAIN: f64 = 128.0;
 
 /// ln k falls by this per saturation, from that of typical scenes on, up to the largest that noise does not feign.
 const PER_SATURATION: f64 = 0.3;

@@ -34,6 +34,8 @@ pub(super) struct Observation {
     pub(super) distance: f64,
     /// 1 - cos of the angle between the direction to the point and the camera's axis.
     pub(super) off_axis: f64,
+    /// The position in the height of the photograph, 0 to 1.
+    pub(super) row: f64,
     /// Whether too many of the values around it are 0 for its brightness to be that of the point.
     pub(super) is_clipped: bool,
 }
@@ -49,6 +51,8 @@ pub(super) struct SceneGeometry {
     pub(super) views_per_point: f64,
     /// log2 exposure of each view at shared points, with mean 0; `None` if it shares too few.
     pub(super) exposures: Vec<Option<f64>>,
+    /// 1 - cos of the angle off the axis at the corner of a photograph that is farthest from it; the median.
+    pub(super) corner: f64,
     /// Those of each point that two views see, unless the points are random.
     pub(super) observations: Vec<Vec<Observation>>,
 }
@@ -98,6 +102,8 @@ impl SceneGeometry {
             overlaps: shares.iter().map(|&(sum, count)| sum / count.max(1) as f64).collect(),
             views_per_point: sum as f64 / visible.max(1) as f64,
             exposures: exposures(&observations, views.len()),
+            corner: median(views.iter().map(|(_, view)| corner(&view.camera)).collect())
+                .unwrap_or_default(),
             observations,
         })
     }
@@ -108,6 +114,14 @@ fn track(point: &Point, views: &[(usize, &View)]) -> Vec<usize> {
     let position =
         |&view: &u32| views.binary_search_by_key(&(view as usize), |(index, _)| *index).ok();
     point.views.iter().filter_map(position).collect()
+}
+
+/// 1 - cos of the angle off the axis at the farthest corner.
+fn corner(camera: &Camera) -> f64 {
+    let size = DVec2::new(camera.width.into(), camera.height.into());
+    let corners = [DVec2::ZERO, DVec2::X, DVec2::Y, DVec2::ONE].map(|at| at * size);
+    let seen = corners.into_iter().filter_map(|at| camera.in_view(at, 1.0));
+    seen.map(|ray| 1.0 - ray.z / ray.length()).fold(0.0, f64::max)
 }
 
 fn pixel(camera: &Camera, point: &Point) -> Option<DVec2> {
@@ -138,8 +152,16 @@ fn observations(
             let in_view = view.camera.view_from_world.transform_point3(points[point].position);
             let distance = in_view.length();
             let off_axis = 1.0 - in_view.z / distance;
-            let light = light.log2();
-            lights[point].push(Observation { view: index, light, distance, off_axis, is_clipped });
+            let (light, height) = (light.log2(), f64::from(view.camera.height));
+            let row = at.map_or(0.0, |at| at.y / height);
+            lights[point].push(Observation {
+                view: index,
+                light,
+                distance,
+                off_axis,
+                row,
+                is_clipped,
+            });
         }
     }
     lights.retain(|seen| seen.len() >= 2);
@@ -243,7 +265,7 @@ mod tests {
     use super::*;
 
     fn observed(view: usize, light: f64) -> Observation {
-        Observation { view, light, distance: 1.0, off_axis: 0.0, is_clipped: false }
+        Observation { view, light, distance: 1.0, off_axis: 0.0, row: 0.0, is_clipped: false }
     }
 
     #[test]

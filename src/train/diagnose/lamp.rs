@@ -12,10 +12,12 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
+pub(super) mod bands;
+pub(super) mod falloff;
 mod fit;
 
-use self::fit::{ALL, ANGLE, LOG_LINEAR, LampObservations, NOTHING};
-use super::geometry::Observation;
+pub(super) use self::fit::LampObservations;
+use self::fit::{ALL, ANGLE, LOG_LINEAR, NOTHING};
 
 /// A lamp is learned if it explains at least this fraction of the variance that exposures leave.
 const MIN_SHARE: f64 = 0.2;
@@ -93,10 +95,10 @@ impl LampDiagnosis {
         )
     }
 
-    /// Measures the observations of points, by point, of this many views.
-    pub(super) fn new(points: &[Vec<Observation>], views: usize) -> Result<Self, String> {
-        let rows = LampObservations::new(points, views)?;
-        let left = Left::new(&rows);
+    /// Measures observations.
+    pub(super) fn new(rows: &LampObservations) -> Result<Self, String> {
+        rows.check_distances()?;
+        let left = Left::new(rows);
         let fit = rows.fit(ALL, true);
         let [exponent, k1, k2, ambient] = fit.coefficients;
         let stops = |more: f64, less: f64| (more - less).max(0.0).sqrt();

@@ -5,6 +5,7 @@ use super::sharpness;
 use super::target_noise::{TargetNoise, target_noise};
 use crate::photographs::image::{Image, Mask, linear_from_srgb};
 use crate::photographs::targets::SceneTone;
+use crate::photographs::tone::NEAR_WHITE;
 use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, bounded, luminance, measurable};
 
 /// Blur is measured in the middle of the photograph, in at most this many pixels each way.
@@ -20,7 +21,7 @@ pub(super) struct PhotographStatistics {
     pub(super) noise_in_target: Option<TargetNoise>,
     /// The mean luminance in linear light.
     pub(super) light: f64,
-    pub(super) clipped_fraction: f64,
+    pub(super) near_white_fraction: f64,
     pub(super) zero_fraction: f64,
     /// The number of different values, of 2^`bits`.
     pub(super) code_values: usize,
@@ -58,7 +59,7 @@ impl PhotographStatistics {
             encoded,
             light: mean(&luminance),
             // Written so that a NaN is neither.
-            clipped_fraction: fraction(|value| value >= 1.0),
+            near_white_fraction: fraction(|value| f64::from(value) >= NEAR_WHITE),
             zero_fraction: fraction(|value| value == 0.0),
             code_values: code_values(counted),
             noise: noise::fit(patches.clone()),

@@ -79,6 +79,20 @@ pub struct PlannedLamp {
     pub why: String,
 }
 
+/// The fall-off of the lens that the photographs are corrected by, with its reason.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlannedFalloff {
+    /// Whether they are.
+    pub on: bool,
+    /// Of u = 1 - cos of the angle off the axis, and of the square of u.
+    #[serde(default)]
+    pub falloff: [f64; 2],
+    /// The reason with its figure, as a sentence.
+    #[serde(default)]
+    pub why: String,
+}
+
 /// Identifies the dataset of a plan by the names and loaded sizes of its training views.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -118,6 +132,9 @@ pub struct Plan {
     pub left_out: Vec<String>,
     /// The dataset that it is for.
     pub dataset: PlannedViews,
+    /// The fall-off of the lens.
+    #[serde(default)]
+    pub falloff: PlannedFalloff,
     /// Whether a tone curve makes the targets; otherwise they are the photographs.
     pub curve: PlannedPart,
     /// Whether each view's exposure is learned.
@@ -152,6 +169,7 @@ impl Plan {
         Self {
             left_out: diagnosis.black_views(),
             dataset: diagnosis.fingerprint.clone(),
+            falloff: falloff(scene),
             curve,
             exposure: spread.exposure(),
             lamp: lamp(scene, config),
@@ -168,6 +186,11 @@ impl Plan {
     pub(in crate::train) fn layer(&self) -> Result<SettingsLayer> {
         let mut layer = SettingsLayer::default();
         let mut set = |key: &str, value: Value| layer.push(key, value, Origin::Plan);
+        if self.falloff.on {
+            let [first, second] = self.falloff.falloff;
+            set("falloff", first.into())?;
+            set("falloff_squared", second.into())?;
+        }
         if !self.curve.on {
             set("tone.curve", ToneCurve::None.name().into())?;
         }
@@ -198,6 +221,7 @@ impl Plan {
         let part = |name, part: &'a PlannedPart| (name, switch(part.on), part.why.as_str());
         let number = |name, it: &'a PlannedNumber| (name, it.value.to_string(), it.why.as_str());
         vec![
+            ("falloff", switch(self.falloff.on), &self.falloff.why),
             part("curve", &self.curve),
             part("exposure", &self.exposure),
             ("lamp", switch(self.lamp.on), &self.lamp.why),
@@ -247,6 +271,20 @@ impl Plan {
             Error::input(path, problem)
         })
     }
+}
+
+fn falloff(scene: &SceneDiagnosis) -> PlannedFalloff {
+    let Some(found) = scene.falloff else {
+        let why = scene.lamp_unknown.as_deref().unwrap_or("the light of a lamp falls off as well");
+        let why = format!("the fall-off of the lens is not measurable: {why}");
+        return PlannedFalloff { on: false, falloff: [0.0; 2], why };
+    };
+    let remedy = match (found.is_corrected, found.is_found()) {
+        (true, _) => "; corrected (falloff = 0 leaves it)",
+        (false, true) => "; not corrected",
+        (false, false) => "",
+    };
+    PlannedFalloff { on: found.is_corrected, falloff: found.falloff, why: found.why() + remedy }
 }
 
 fn curve(scene: &SceneDiagnosis) -> PlannedPart {

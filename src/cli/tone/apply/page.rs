@@ -69,7 +69,7 @@ impl TonePage {
         let mut pictures =
             vec![picture("photograph", None, photograph), picture(&self.curve, scores, image)];
         for (set, distribution) in &mut self.compared {
-            let (_, image, _) = set.result(photograph, gaps)?;
+            let (_, image, _) = set.result(photograph, gaps, true)?;
             distribution.add(&without(&image, gaps));
             let scores = reference.as_ref().map(|reference| Scores::measure(&image, reference));
             pictures.push(picture(&distribution.name, scores.transpose()?, &image));
@@ -116,8 +116,8 @@ fn picture(caption: &str, scores: Option<Scores>, image: &Image) -> Picture {
 fn table(output: &ToneOutput) -> NumberTable {
     let column =
         |name: &str, digits| Column { name: name.to_owned(), digits, best: Best::Unmarked };
-    let measured = |Measures { mean_luminance, clipped_fraction, skewness, .. }: Measures| {
-        [Some(mean_luminance), Some(skewness), Some(100.0 * clipped_fraction)]
+    let measured = |Measures { mean_luminance, near_white_fraction, skewness, .. }: Measures| {
+        [Some(mean_luminance), Some(skewness), Some(100.0 * near_white_fraction)]
     };
     let views = output.views.iter().map(|(name, report)| (name.clone(), *report));
     let rows = views.chain([("scene".to_owned(), output.scene)]).map(|(name, report)| {
@@ -142,10 +142,10 @@ fn table(output: &ToneOutput) -> NumberTable {
             column("delta0", 4),
             column("mean Y", 4),
             column("skewness", 2),
-            column("clipped, %", 1),
+            column("near white, %", 1),
             column("mean Y after", 4),
             column("skewness after", 2),
-            column("clipped after, %", 1),
+            column("near white after, %", 1),
             column("PSNR, dB", 2),
             column("SSIM", 3),
         ],

@@ -84,7 +84,7 @@ pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<Input
     } else if Dataset::is_at(input) {
         let options = LoadOptions { reference: args.reference.clone(), ..LoadOptions::default() };
         let of_dataset = Dataset::photographs(input, &options)?;
-        let borders = Arc::new(Borders::of_photographs(&of_dataset));
+        let borders = Arc::new(Borders::of_photographs(&of_dataset, &options));
         let of_view = |Photograph { name, split, input, reference, mask }| InputPhotograph {
             name,
             input,

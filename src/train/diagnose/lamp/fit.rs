@@ -31,16 +31,18 @@ pub(super) const ALL: Terms = [true; TERMS];
 const BOUNDS: [f64; TERMS] = [4.0, 100.0, 1000.0, 0.5];
 
 /// The observations that are fitted to, in columns, with the range of each point's.
-pub(super) struct LampObservations {
-    view: Vec<usize>,
+pub(in super::super) struct LampObservations {
+    pub(super) view: Vec<usize>,
     /// log2 of the brightness.
     light: Vec<f64>,
     /// log2 (distance / `d_ref`).
     distance: Vec<f64>,
     /// u.
     off_axis: Vec<f64>,
+    /// The position in the photograph's height, 0 to 1.
+    pub(super) row: Vec<f64>,
     pub(super) groups: Vec<Range<usize>>,
-    views: usize,
+    pub(super) views: usize,
     pub(super) d_ref: f64,
 }
 
@@ -52,7 +54,7 @@ pub(super) struct LampFit {
 
 impl LampObservations {
     /// The unclipped observations of points that two views see.
-    pub(super) fn new(points: &[Vec<Observation>], views: usize) -> Result<Self, String> {
+    pub(in super::super) fn new(points: &[Vec<Observation>], views: usize) -> Result<Self, String> {
         let clean = |point: &Vec<Observation>| -> Vec<Observation> {
             point.iter().copied().filter(|one| !one.is_clipped).collect()
         };
@@ -75,25 +77,31 @@ impl LampObservations {
                 rows.light.push(one.light);
                 rows.distance.push((one.distance / rows.d_ref).log2());
                 rows.off_axis.push(one.off_axis);
+                rows.row.push(one.row);
             }
             rows.groups.push(start..rows.view.len());
-        }
-        let spread = trimmed_variance(rows.less_point(rows.distance.clone())).sqrt();
-        if spread < MIN_DISTANCES {
-            let percent = |stops: f64| 100.0 * (stops.exp2() - 1.0);
-            return Err(format!(
-                "the distances of a point from its cameras differ by {:.1} %; {:.1} % is needed",
-                percent(spread),
-                percent(MIN_DISTANCES)
-            ));
         }
         Ok(rows)
     }
 
+    /// Refuses points whose distances from their cameras hardly differ.
+    pub(super) fn check_distances(&self) -> Result<(), String> {
+        let spread = trimmed_variance(self.less_point(self.distance.clone())).sqrt();
+        let percent = |stops: f64| 100.0 * (stops.exp2() - 1.0);
+        if spread >= MIN_DISTANCES {
+            return Ok(());
+        }
+        Err(format!(
+            "the distances of a point from its cameras differ by {:.1} %; {:.1} % is needed",
+            percent(spread),
+            percent(MIN_DISTANCES)
+        ))
+    }
+
     fn empty(views: usize, d_ref: f64) -> Self {
         let (view, groups) = (vec![], vec![]);
-        let [light, distance, off_axis] = [const { vec![] }; 3];
-        Self { view, light, distance, off_axis, groups, views, d_ref }
+        let [light, distance, off_axis, row] = [const { vec![] }; 4];
+        Self { view, light, distance, off_axis, row, groups, views, d_ref }
     }
 
     /// The points of the groups whose indices a predicate takes.
@@ -105,6 +113,7 @@ impl LampObservations {
             part.light.extend_from_slice(&self.light[rows.clone()]);
             part.distance.extend_from_slice(&self.distance[rows.clone()]);
             part.off_axis.extend_from_slice(&self.off_axis[rows.clone()]);
+            part.row.extend_from_slice(&self.row[rows.clone()]);
             part.groups.push(start..part.view.len());
         }
         part
@@ -114,7 +123,6 @@ impl LampObservations {
     pub(super) fn fit(&self, terms: Terms, with_exposures: bool) -> LampFit {
         const LINEAR_ROUNDS: usize = 5;
         const ROUNDS: usize = 10;
-        const HUBER: f64 = 1.5;
         let mut weights = vec![1.0; self.view.len()];
         let mut coefficients = [0.0; TERMS];
         let left = |coefficients, weights: &[f64]| {
@@ -149,12 +157,60 @@ impl LampObservations {
                 coefficients = shorter;
                 residuals
             });
-            let scale = 1.4826 * median(residuals.iter().map(|r| r.abs()).collect()).unwrap_or(0.0);
-            for (weight, residual) in weights.iter_mut().zip(&residuals) {
-                *weight = (HUBER * scale / residual.abs().max(1e-9)).clamp(1e-6, 1.0);
-            }
+            weights = huber_weights(&residuals);
         }
         LampFit { coefficients, exposures: left(coefficients, &weights).1 }
+    }
+
+    /// k1 and k2 of k1 u + k2 u^2, the stops by which light falls, beside exposures.
+    pub(super) fn fit_falloff(&self) -> [f64; 2] {
+        const ROUNDS: usize = 6;
+        let mut weights = vec![1.0; self.view.len()];
+        let mut found = nalgebra::Vector2::zeros();
+        for _ in 0..ROUNDS {
+            let projected = |mut column: Vec<f64>| {
+                self.project(&mut column, &weights, true);
+                column
+            };
+            let light = projected(self.light.clone());
+            let slopes = [1, 2].map(|power| {
+                projected(self.off_axis.iter().map(|u: &f64| -u.powi(power)).collect())
+            });
+            let dot = |a: &[f64], b: &[f64]| -> f64 {
+                a.iter().zip(b).zip(&weights).map(|((a, b), weight)| weight * a * b).sum()
+            };
+            let normal = nalgebra::Matrix2::from_fn(|i, j| dot(&slopes[i], &slopes[j]));
+            let right = nalgebra::Vector2::from_fn(|i, _| dot(&slopes[i], &light));
+            let Some(solved) = normal.lu().solve(&right) else { break };
+            found = solved;
+            let left =
+                |row: usize| light[row] - found[0] * slopes[0][row] - found[1] * slopes[1][row];
+            let left: Vec<f64> = (0..light.len()).map(left).collect();
+            weights = huber_weights(&left);
+        }
+        found.into()
+    }
+
+    /// u beyond which this share of the observations is.
+    pub(super) fn outermost(&self, share: f64) -> f64 {
+        let mut sorted = self.off_axis.clone();
+        sorted.sort_unstable_by(f64::total_cmp);
+        let index = ((1.0 - share) * sorted.len() as f64) as usize;
+        sorted.get(index).copied().unwrap_or(0.0)
+    }
+
+    /// What points and exposures leave of the brightness less a column, with the weights of a robust fit.
+    pub(super) fn left_by_exposures(&self, less: Option<&[f64]>) -> (Vec<f64>, Vec<f64>) {
+        const ROUNDS: usize = 3;
+        let mut weights = vec![1.0; self.view.len()];
+        let mut left = vec![];
+        for _ in 0..ROUNDS {
+            let less = |row: usize| less.map_or(0.0, |less| less[row]);
+            left = self.light.iter().enumerate().map(|(row, light)| light - less(row)).collect();
+            self.project(&mut left, &weights, true);
+            weights = huber_weights(&left);
+        }
+        (left, weights)
     }
 
     /// What a fit to other points leaves of the brightness, about the median of each point; without the views that
@@ -238,6 +294,14 @@ impl LampObservations {
         let value = |view: usize| (!unseen(view)).then(|| of_views[view] - mean);
         (0..self.views).map(value).collect()
     }
+}
+
+/// Huber's weights of residuals.
+fn huber_weights(residuals: &[f64]) -> Vec<f64> {
+    const HUBER: f64 = 1.5;
+    let scale = 1.4826 * median(residuals.iter().map(|r| r.abs()).collect()).unwrap_or(0.0);
+    let weight = |residual: &f64| (HUBER * scale / residual.abs().max(1e-9)).clamp(1e-6, 1.0);
+    residuals.iter().map(weight).collect()
 }
 
 /// The coefficients within the bounds at which the linearised, weighted square is smallest: coordinate descent.

@@ -1,0 +1,188 @@
+//! What is odd about photographs is said by every command that looks at them, and corrected where it can be.
+
+use std::fs;
+use std::path::Path;
+
+use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};
+use nightsplat::photographs::dataset::{Dataset, LoadOptions};
+use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
+use nightsplat::train::diagnose::Diagnosis;
+
+use crate::common::command::{run, succeed};
+
+const SET: SyntheticOptions = SyntheticOptions {
+    views: 16,
+    width: 96,
+    height: 72,
+    seed: 4,
+    fisheye: false,
+    street: None,
+    lamp: None,
+    night: synthetic::Night::NONE,
+};
+
+/// A dark set whose training photographs are changed by a function of photograph, column, row and linear light.
+fn changed(change: impl Fn(usize, [u32; 2], f64) -> f64) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let capture = Capture { darkening: 6.0, ..Capture::default() };
+    synthetic::write_captured(folder.path(), &SET, &capture).unwrap();
+    let entries = fs::read_dir(folder.path().join("low")).unwrap();
+    let mut paths: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
+    paths.sort();
+    for (index, path) in paths.iter().enumerate() {
+        let image = Image::load(path).unwrap();
+        let pixel = |x, y| {
+            let light = |value: f32| change(index, [x, y], linear_from_srgb(value).into()) as f32;
+            image.pixel(x, y).map(|value| srgb_from_linear(light(value)).clamp(0.0, 1.0))
+        };
+        Image::from_fn(image.width, image.height, pixel).save_png8(path).unwrap();
+    }
+    folder
+}
+
+fn plain() -> tempfile::TempDir {
+    changed(|_, _, light| light)
+}
+
+/// The distance from the middle, 1 at a corner.
+fn off([x, y]: [u32; 2]) -> f64 {
+    let half = [48.0, 36.0];
+    (f64::from(x) + 0.5 - half[0]).hypot(f64::from(y) + 0.5 - half[1]) / half[0].hypot(half[1])
+}
+
+fn vignetted() -> tempfile::TempDir {
+    changed(|_, at, light| light / (1.0 + off(at).powi(2)).powi(2))
+}
+
+fn diagnosed(folder: &Path) -> (Dataset, Diagnosis) {
+    Diagnosis::load(folder, &LoadOptions::default()).unwrap()
+}
+
+#[test]
+fn a_plain_set_has_no_finding_and_keeps_its_bits() {
+    let folder = plain();
+    let (dataset, found) = diagnosed(folder.path());
+    assert_eq!(found.remarks, [""; 0]);
+    let falloff = found.scene.falloff.unwrap();
+    assert!(!falloff.is_found() && !falloff.is_corrected && falloff.corner > 0.8, "{falloff:?}");
+    let plain = LoadOptions { mask_overlays: false, falloff: Some([0.0; 2]), ..Default::default() };
+    let as_stored = Dataset::load(folder.path(), &plain).unwrap();
+    for (view, stored) in dataset.views.iter().zip(&as_stored.views) {
+        assert!(view.image == stored.image && view.mask.is_none(), "{}", view.name);
+    }
+}
+
+#[test]
+fn dark_corners_are_measured_and_evened_out_in_memory_and_when_read_again() {
+    let (even, folder) = (plain(), vignetted());
+    let falloff = diagnosed(folder.path()).1.scene.falloff.unwrap();
+    assert!(falloff.is_found() && falloff.is_corrected, "{falloff:?}");
+    assert!((falloff.corner - 0.25).abs() < 0.06 && falloff.error < 0.1, "{falloff:?}");
+    let uncorrected = LoadOptions { falloff: Some([0.0; 2]), ..LoadOptions::default() };
+    let (_, left) = Diagnosis::load(folder.path(), &uncorrected).unwrap();
+    assert!(!left.scene.falloff.unwrap().is_corrected);
+    let light = |folder: &Path, options: &LoadOptions| -> Vec<f64> {
+        let dataset = Dataset::load(folder, options).unwrap();
+        let images = dataset.train_views().map(|view| view.loaded().unwrap().unwrap().into_owned());
+        let outer = |image: Image| -> f64 {
+            let pixels = (0..image.height).flat_map(|y| (0..image.width).map(move |x| [x, y]));
+            let light = |[x, y]: [u32; 2]| f64::from(linear_from_srgb(image.pixel(x, y)[1]));
+            pixels.filter(|&at| off(at) > 0.8).map(light).sum()
+        };
+        images.map(outer).collect()
+    };
+    let evened = LoadOptions { falloff: Some(falloff.falloff), ..LoadOptions::default() };
+    let truth = light(even.path(), &LoadOptions::default());
+    let dark = light(folder.path(), &LoadOptions::default());
+    let kept = light(folder.path(), &evened);
+    for ((evened, dark), truth) in kept.iter().zip(dark).zip(truth) {
+        assert!(dark < 0.45 * truth && (evened / truth).log2().abs() < 0.3, "{evened} for {truth}");
+    }
+    let read_again = LoadOptions { keep: Some(0), ..evened };
+    assert_eq!(light(folder.path(), &read_again), kept);
+}
+
+#[test]
+fn a_run_records_the_falloff_and_a_plan_file_repeats_it() {
+    let folder = vignetted();
+    let (root, out) = (folder.path().display(), folder.path().join("run"));
+    let plan = folder.path().join("plan.toml");
+    let text = succeed(&format!("diagnose {root} --plan {}", plan.display()));
+    let line = text.lines().find(|line| line.starts_with("falloff")).unwrap();
+    assert!(line.contains(" on ") && line.contains("of the light of the middle"), "{line}");
+    for more in [String::new(), format!("--plan {}", plan.display())] {
+        let (printed, _) =
+            run(&format!("train {root} --out {} --steps 2 --overwrite {more}", out.display()), 0);
+        assert!(printed.contains(line), "{printed}");
+        let config = fs::read_to_string(out.join("config.toml")).unwrap();
+        assert!(config.lines().any(|line| line.starts_with("falloff = ")), "{config}");
+    }
+    let off = format!("train {root} --out {} --steps 2 --overwrite --set falloff=0", out.display());
+    assert!(!run(&off, 0).0.lines().any(|line| line.starts_with("falloff  on")));
+}
+
+#[test]
+fn bands_of_rows_are_found_and_their_height_is_measured() {
+    let band = |index: usize, [_, y]: [u32; 2], light: f64| {
+        let phase = 2.4 * index as f64;
+        light * (0.35 * (std::f64::consts::TAU * f64::from(y) / 30.0 + phase).sin()).exp2()
+    };
+    let (_, found) = diagnosed(changed(band).path());
+    let remark = found.remarks.iter().find(|remark| remark.starts_with("rows differ")).unwrap();
+    assert!(remark.contains("by 0.7 stops") || remark.contains("by 0.6 stops"), "{remark}");
+    assert!(remark.contains("in 2.5 bands") || remark.contains("in 2.2 bands"), "{remark}");
+    // Half of that is not worth a sentence.
+    let (_, found) =
+        diagnosed(changed(|i, at, light| light.sqrt() * band(i, at, light).sqrt()).path());
+    assert!(!found.remarks.iter().any(|remark| remark.starts_with("rows")), "{:?}", found.remarks);
+}
+
+#[test]
+fn what_is_burnt_in_is_masked_in_every_view_and_said() {
+    let bar = |index: usize, [x, y]: [u32; 2], light: f64| match y {
+        0..56 => light,
+        // Black, with text of which the end changes.
+        58..70 => {
+            let shift = if x >= 64 { index as u32 } else { 0 };
+            f64::from(u8::from((x + shift) % 5 < 2 && y % 4 < 3))
+        }
+        _ => 0.0,
+    };
+    let folder = changed(bar);
+    let root = folder.path().display();
+    let (dataset, _) = diagnosed(folder.path());
+    for view in dataset.train_views() {
+        let mask = view.mask.as_ref().unwrap();
+        let is_hidden = |y: usize| mask.weights[96 * y..][..96].iter().all(|&weight| weight == 0.0);
+        assert!((56..72).all(is_hidden), "{}", view.name);
+        assert!((0..52).all(|y| mask.weights[96 * y..][..96].iter().all(|&one| one == 1.0)));
+    }
+    let out = folder.path().join("out");
+    for command in
+        [format!("diagnose {root}"), format!("tone apply {root} --out {}", out.display())]
+    {
+        let (_, warned) = run(&command, 0);
+        assert!(warned.contains("to 71, columns 0 to 95 of the photographs of 96x72"), "{warned}");
+    }
+    let train = format!("train {root} --out {} --steps 2 --set mask_overlays=false", out.display());
+    assert!(!run(&(train + " --overwrite"), 0).1.contains("hardly change"));
+    let plain = LoadOptions { mask_overlays: false, ..LoadOptions::default() };
+    let dataset = Dataset::load(folder.path(), &plain).unwrap();
+    assert!(dataset.views.iter().all(|view| view.mask.is_none()));
+}
+
+#[test]
+fn every_command_that_looks_at_photographs_says_what_is_odd() {
+    let veil = f64::from(linear_from_srgb(24.0 / 255.0));
+    let folder = changed(|_, _, light| light + veil);
+    let (root, out) = (folder.path().display(), folder.path().join("run"));
+    let finding = "black is raised: no photograph is darker than 24 of 255";
+    for command in ["diagnose", "diagnose --json", "tone apply", "tone apply --json"] {
+        let (printed, _) = run(&format!("{command} {root}"), 0);
+        assert!(printed.contains(finding), "{command}: {printed}");
+    }
+    let (_, warned) = run(&format!("train {root} --out {} --steps 2", out.display()), 0);
+    assert!(warned.contains(finding), "{warned}");
+    let (printed, _) = run(&format!("tone apply {root} --brightness 0.93"), 0);
+    assert!(printed.contains("near white (0.94 and above)"), "{printed}");
+}
