@@ -344,7 +344,10 @@ mod tests {
     use super::*;
 
     /// Photographs of 64 x 64 in 8 or 16 bits, of codes by photograph and pixel.
-    struct Set(tempfile::TempDir, Vec<PathBuf>);
+    struct Set {
+        _folder: tempfile::TempDir,
+        paths: Vec<PathBuf>,
+    }
 
     impl Set {
         fn new(count: u32, is_wide: bool, code: impl Fn(u32, u32) -> u32) -> Self {
@@ -363,11 +366,11 @@ mod tests {
                 path
             };
             let paths = (0..count).map(path).collect();
-            Self(folder, paths)
+            Self { _folder: folder, paths }
         }
 
         fn levels(&self, light: Option<StoredLight>) -> Levels {
-            Levels::of_all(light, &self.1.iter().map(PathBuf::as_path).collect::<Vec<_>>())
+            Levels::of_all(light, &self.paths.iter().map(PathBuf::as_path).collect::<Vec<_>>())
         }
 
         /// Black and white, if they are not as stored.
@@ -408,10 +411,10 @@ mod tests {
         let beyond =
             Set::new(17, true, |one, at| dark(one, at, 80) + if one == 1 { 1000 } else { 0 });
         assert_eq!(beyond.found(), None);
-        let some = Levels::of_set(None, beyond.1.iter().map(|path| (path.as_path(), None)));
+        let some = Levels::of_set(None, beyond.paths.iter().map(|path| (path.as_path(), None)));
         let photograph = |at: usize| {
             let colours = super::super::ColourCounts::of_levels(some);
-            let file = PictureFile::open(&beyond.1[at]).unwrap();
+            let file = PictureFile::open(&beyond.paths[at]).unwrap();
             let (image, _) = file.decode_counted(&colours).unwrap();
             (image, colours.is_beyond())
         };
