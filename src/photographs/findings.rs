@@ -45,15 +45,20 @@ pub(crate) fn findings(
         empty_channels(&lit),
         mixed(&lit),
         exposure.and_then(|_| gain_at_its_limit(&lit)),
-        (near_white > MAX_NEAR_WHITE).then(|| {
-            format!(
-                "the curve brings {:.0} % of the pixels near white ({NEAR_WHITE} and above), where lamps and sky lose \
-                 their detail: `--brightness 0.3` keeps it",
-                100.0 * near_white
-            )
-        }),
+        too_near_white(near_white),
     ];
     sentences.into_iter().flatten().collect()
+}
+
+/// The finding about the share of pixels that a curve brings near white.
+pub(crate) fn too_near_white(share: f64) -> Option<String> {
+    (share > MAX_NEAR_WHITE).then(|| {
+        format!(
+            "the curve brings {:.0} % of the pixels near white ({NEAR_WHITE} and above), where lamps and sky lose \
+             their detail: `--brightness 0.3` keeps it",
+            100.0 * share
+        )
+    })
 }
 
 /// The share of pixels that an automatic curve brings near white, by its formula for grey; the mean of photographs.
@@ -120,7 +125,7 @@ fn empty_channels(lit: &[&MeasuredPhotograph]) -> Option<String> {
     };
     (!empty.is_empty()).then(|| {
         format!(
-            "{} of the photographs is empty (mean {:.4}; {} has {largest:.4}): brightness counts three channels; save \
+            "the photographs are empty in {} (mean {:.4}; {} has {largest:.4}): brightness counts three channels; save \
              grey photographs of what there is",
             named(&empty),
             empty.iter().map(|&channel| means[channel]).fold(0.0, f64::max),
@@ -213,7 +218,7 @@ mod tests {
     fn empty_channels_are_found() {
         let values: Vec<(f32, usize)> = (0..1000).map(|index| (index as f32 / 5e3, 1)).collect();
         let text = found(&[coloured(&values, [0.01, 1.0, 0.0])]);
-        assert!(text.starts_with("red and blue of the photographs is empty"), "{text}");
+        assert!(text.starts_with("the photographs are empty in red and blue"), "{text}");
         assert_eq!(found(&[coloured(&values, [0.3, 1.0, 0.1])]), "");
     }
 
