@@ -113,10 +113,10 @@ fn extremes(all: &LuminanceHistogram) -> Option<String> {
 
 fn empty_channels(lit: &[&MeasuredPhotograph]) -> Option<String> {
     const NAMES: [&str; 3] = ["red", "green", "blue"];
-    let of = |channel: usize| {
+    let sum = |channel: usize| {
         lit.iter().map(|one| f64::from(one.statistics.channel_means[channel])).sum::<f64>()
     };
-    let means = [0, 1, 2].map(|channel| of(channel) / lit.len() as f64);
+    let means = [0, 1, 2].map(|channel| sum(channel) / lit.len() as f64);
     let largest = means.into_iter().fold(0.0, f64::max);
     let (empty, used): (Vec<_>, Vec<_>) =
         (0..3).partition(|&channel| means[channel] < MIN_CHANNEL * largest);
@@ -150,10 +150,10 @@ fn mixed(lit: &[&MeasuredPhotograph]) -> Option<String> {
 }
 
 fn gain_at_its_limit(lit: &[&MeasuredPhotograph]) -> Option<String> {
-    let own = |one: &&&MeasuredPhotograph| {
+    let needs_more = |one: &&&MeasuredPhotograph| {
         Exposure::measure([&one.luminance], None).is_some_and(|found| found.gain > 0.999 * MAX_GAIN)
     };
-    let limited: Vec<_> = lit.iter().filter(own).collect();
+    let limited: Vec<_> = lit.iter().filter(needs_more).collect();
     let means = limited.iter().map(|one| one.luminance.mean());
     (!limited.is_empty()).then(|| {
         format!(
