@@ -26,9 +26,9 @@ use crate::train::{Preset, RequestedSettings, diagnosed};
 /// lets you edit the plan. Reference images are not used.
 ///
 /// Columns of the table: p10, p90, mean and cubic mean of the encoded luminance; r = p10 / p90; EV: stops above the
-/// other views of the same points; white and black: values near white (0.94 and above) and zero values; codes: distinct values; luma and chroma
-/// noise: standard deviations in the target, after the tone curve, with JPEG and quantisation noise; blur: width of
-/// edges, pixels; points: visible points; overlap: share of the view that other views see.
+/// other views of the same points; white and black: values near white (0.94 and above) and zero values; codes: distinct
+/// values; luma and chroma noise: standard deviations in the target, after the tone curve, with JPEG and quantisation
+/// noise; blur: width of edges, pixels; points: visible points; overlap: share of the view that other views see.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct DiagnoseArgs {

@@ -104,6 +104,8 @@ pub struct SceneDiagnosis {
     pub darkening: f64,
     /// The brightness of the targets over that of the photographs; below 1.5 no curve is needed.
     pub brightening: f64,
+    /// The share of pixels that `--curve auto` brings near white, 0.94 or more.
+    pub brought_near_white: f64,
     /// The gain of `--curve auto`, for encoded values.
     pub gain: f64,
     /// The standard deviation of the views' exposures, in stops; of their gains, if the points do not determine
@@ -235,8 +237,7 @@ impl Diagnosis {
         let mut remarks = remarks(&diagnosed, &photographs, &views, &without_pose);
         let tracks = LampObservations::new(&shared.observations, views.len());
         remarks.extend(tracks.as_ref().ok().and_then(bands::remark));
-        let near_white = brought_near_white(&measured, &exposure);
-        remarks.extend(findings(&measured, Some(&exposure), near_white));
+        remarks.extend(findings(&measured, Some(&exposure), 0.0));
         let mut scene = SceneDiagnosis::new(
             &diagnosed,
             photographs,
@@ -245,6 +246,7 @@ impl Diagnosis {
             &exposure,
             dataset.points.len(),
         );
+        scene.brought_near_white = brought_near_white(&measured, &exposure);
         // A pixel of a resized target averages this many pixels in each direction.
         let shrink = diagnosed.iter().map(|view| options.shrink(view.size[0], view.size[1]));
         scene.target_noise /= shrink.fold(1.0, f64::max);
@@ -380,6 +382,7 @@ impl SceneDiagnosis {
             light,
             darkening: darkening(light),
             brightening: exposure.brightening(),
+            brought_near_white: 0.0,
             gain: exposure.gain,
             exposure_spread: measured.unwrap_or(exposure.spread / std::f64::consts::LN_2),
             spread_is_measured: measured.is_some(),

@@ -174,6 +174,8 @@ mod tests {
             "tone.brightness=0.5",
             "tone.law=a",
             "extent=2",
+            "light=linear",
+            "falloff=1",
             "schedule.first_sh_degree=1",
         ];
         set.extend(rest.map(str::to_owned));

@@ -171,11 +171,13 @@ impl InverseTone {
         let step = |y: f64| luminance(solved(self.factor([y; 3])));
         let mut y = luminance(rgb);
         let mut before: Option<[f64; 2]> = None;
+        let [mut low, mut high] = [f64::NEG_INFINITY, f64::INFINITY];
         for _ in 0..TRIALS {
             let error = step(y) - y;
             if error.abs() <= PRECISION * y.abs() {
                 break;
             }
+            *(if error > 0.0 { &mut low } else { &mut high }) = y;
             let next = match before {
                 Some([other, other_error]) if (other_error - error).abs() > f64::MIN_POSITIVE => {
                     y + error * (y - other) / (other_error - error)
@@ -183,7 +185,9 @@ impl InverseTone {
                 _ => y + error,
             };
             before = Some([y, error]);
-            y = if next.is_finite() && next * y > 0.0 { next } else { y + error };
+            // Where the curve is flat, the difference of two errors is that of their rounding.
+            let is_between = next > low && next < high;
+            y = if next * y > 0.0 && is_between { next } else { y + error };
         }
         rgb = solved(self.factor([y; 3]));
         Inverted { rgb, is_clipped }

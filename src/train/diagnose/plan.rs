@@ -8,7 +8,8 @@ use toml::Value;
 use super::{Diagnosis, SceneDiagnosis};
 use crate::base::input;
 use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::tone::ToneCurve;
+use crate::photographs::findings::too_near_white;
+use crate::photographs::tone::{Tone, ToneCurve};
 use crate::splats::scene::{Features, Shape, width};
 use crate::train::layers::{Origin, SettingsLayer};
 use crate::train::{LampConfig, TrainConfig};
@@ -163,7 +164,7 @@ impl Plan {
     pub(crate) fn new(diagnosis: &Diagnosis, config: &TrainConfig, memory: u64) -> Self {
         let scene = &diagnosis.scene;
         let sh_degree = sh_degree(scene, config);
-        let curve = curve(scene);
+        let curve = curve(scene, config);
         let follows_views = curve.on && !config.tone.scene_statistics;
         let spread = Spread::new(scene, follows_views, diagnosis.views.len());
         Self {
@@ -287,7 +288,7 @@ fn falloff(scene: &SceneDiagnosis) -> PlannedFalloff {
     PlannedFalloff { on: found.is_corrected, falloff: found.falloff, why: found.why() + remedy }
 }
 
-fn curve(scene: &SceneDiagnosis) -> PlannedPart {
+fn curve(scene: &SceneDiagnosis, config: &TrainConfig) -> PlannedPart {
     let SceneDiagnosis { brightening, mean_luminance, .. } = scene;
     let on = *brightening >= MIN_BRIGHTENING;
     let verdict = if on { "dark" } else { "well lit" };
@@ -295,7 +296,13 @@ fn curve(scene: &SceneDiagnosis) -> PlannedPart {
         "{verdict}: targets are {brightening:.1} times as bright as the photographs (mean luminance \
          {mean_luminance:.3}; threshold {MIN_BRIGHTENING})"
     );
-    PlannedPart { on, why }
+    // A user who asks for a curve or a brightness has seen the targets.
+    let is_asked = config.tone.curve != Tone::Auto || config.tone.brightness.is_some();
+    let near_white = too_near_white(scene.brought_near_white).filter(|_| on && !is_asked);
+    PlannedPart {
+        on,
+        why: [Some(why), near_white].into_iter().flatten().collect::<Vec<_>>().join("; "),
+    }
 }
 
 /// The spread of the targets' exposures.

@@ -191,7 +191,7 @@ fn joined(mut found: Vec<Overlay>, cell: usize, width: usize) -> Vec<Overlay> {
 struct OverlayViews<'a> {
     views: &'a [&'a [f32]],
     grid: &'a PixelGrid,
-    /// Of which so many may differ.
+    /// The number of them that may differ.
     most: usize,
 }
 
