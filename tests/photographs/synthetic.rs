@@ -5,7 +5,9 @@ use std::path::Path;
 
 use glam::{DVec2, DVec3};
 use nightsplat::camera::CameraModel;
-use nightsplat::photographs::dataset::synthetic::{self, DARKENING, Night, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic::{
+    self, CameraFaults, DARKENING, Night, SyntheticOptions,
+};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
 use nightsplat::photographs::image::{Image, linear_from_srgb};
 
@@ -206,8 +208,22 @@ mod command {
         let (width, height) = (Some(16), Some(16));
         let (views, seed) = (Some(SMALL.views), SMALL.seed);
         let dir = dir.to_owned();
-        let (street, fisheye, lamp) = (None, false, None);
-        SynthArgs { dir, street, views, width, height, seed, fisheye, lamp, overwrite }
+        let (street, fisheye, lamp, brackets) = (None, false, None, None);
+        let (night, faults) = (Night::NONE, CameraFaults::default());
+        SynthArgs {
+            dir,
+            street,
+            views,
+            width,
+            height,
+            seed,
+            fisheye,
+            lamp,
+            night,
+            faults,
+            brackets,
+            overwrite,
+        }
     }
 
     #[test]
