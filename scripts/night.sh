@@ -51,13 +51,13 @@ def light(images):
     values = b"".join(images)
     planes = zip((0.2126, 0.7152, 0.0722), (values[channel::3] for channel in range(3)))
     return sum(weight * mean(plane) for weight, plane in planes) / 255, 100 * mean([b >= 250 for b in values])
-psnr = lambda a, b: 10 * math.log10(255 ** 2 / mean([(x - y) ** 2 for x, y in zip(a, b)]))
 targets, right, found = images(scratch / "targets"), images(references), read("diagnosis")
-scores = [psnr(a, b) for a, b in zip(targets, right, strict=True)]
+pairs = zip(b"".join(targets), b"".join(right), strict=True)
+psnr = 10 * math.log10(255 ** 2 / mean([(a - b) ** 2 for a, b in pairs]))
 (luminance, white), (luminance_right, white_right) = light(targets), light(right)
 lines = [line.strip().removeprefix("WARN ") for line in (scratch / "lines").read_text().splitlines()]
 said = ["curve " + ("on" if found["plan"]["curve"]["on"] else "off"), *dict.fromkeys(lines), *found["remarks"]]
-cells = [kind, f"{mean(scores):.2f}", f"{luminance:.3f} ({luminance_right:.3f})",
+cells = [kind, f"{psnr:.2f}", f"{luminance:.3f} ({luminance_right:.3f})",
          f"{white:.1f} ({white_right:.1f})", f"{read('applied')['exposure']['gain']:.1f}", "; ".join(said)]
 trained = [f"{read('scores')['mean']['psnr']:.2f}"] if (scratch / "scores").exists() else []
 print("|", " | ".join([*cells[:-1], *trained, cells[-1]]), "|", flush=True)

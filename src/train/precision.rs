@@ -200,8 +200,8 @@ mod tests {
             assert_eq!((bits(&back), kept), (bits(&values), expected), "{different} different");
         }
         let signed: Vec<f32> = photograph(60_003, 251).iter().map(|value| value - 0.1).collect();
-        let (back, kept) = kept(PhotographBits::Exact, &signed);
-        assert_eq!((bits(&back), kept), (bits(&signed), 8));
+        let (back, stored) = kept(PhotographBits::Exact, &signed);
+        assert_eq!((bits(&back), stored), (bits(&signed), 8));
         let values = photograph(60_003, 251);
         let (back, kept) = kept(PhotographBits::Single, &values);
         assert_eq!((bits(&back), kept), (bits(&values), 32));

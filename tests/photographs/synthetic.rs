@@ -9,7 +9,7 @@ use nightsplat::photographs::dataset::synthetic::{self, DARKENING, Night, Synthe
 use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
 use nightsplat::photographs::image::{Image, linear_from_srgb};
 
-use crate::common::command::run;
+use crate::common::command::{refused, run};
 use crate::common::train::small_set;
 
 const SMALL: SyntheticOptions = SyntheticOptions {
@@ -198,49 +198,17 @@ fn every_eighth_view_is_a_test_view() {
     assert!(dataset.views.iter().enumerate().all(is_test));
 }
 
-mod command {
-    use super::*;
-    use nightsplat::cli::synth::{SynthArgs, run};
-
-    fn args(dir: &Path, overwrite: bool) -> SynthArgs {
-        let (width, height) = (Some(16), Some(16));
-        let (views, seed) = (Some(SMALL.views), SMALL.seed);
-        let dir = dir.to_owned();
-        let (street, fisheye, lamp, brackets) = (None, false, None, None);
-        let (night, faults) = Default::default();
-        SynthArgs {
-            dir,
-            street,
-            views,
-            width,
-            height,
-            seed,
-            fisheye,
-            lamp,
-            night,
-            faults,
-            brackets,
-            overwrite,
-        }
-    }
-
-    #[test]
-    fn a_folder_that_is_not_empty_is_kept_unless_overwritten() {
-        let dir = tempfile::tempdir().unwrap();
-        std::fs::write(dir.path().join("letter.txt"), "mine").unwrap();
-        let problem = run(args(dir.path(), false)).unwrap_err().to_string();
-        assert!(problem.contains("--overwrite"), "{problem}");
-        assert_eq!(files(dir.path()).len(), 1);
-        run(args(dir.path(), true)).unwrap();
-        assert_eq!(files(dir.path())["letter.txt"], b"mine");
-    }
-
-    #[test]
-    fn a_missing_folder_is_created() {
-        let dir = tempfile::tempdir().unwrap();
-        run(args(&dir.path().join("new"), false)).unwrap();
-        assert!(dir.path().join("new/transforms_train.json").is_file());
-    }
+#[test]
+fn a_folder_that_is_not_empty_is_kept_unless_overwritten_and_a_missing_one_is_created() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("letter.txt"), "mine").unwrap();
+    let synth = |dir: &Path| format!("synth {} --views 3 --width 16 --height 16", dir.display());
+    refused(&synth(dir.path()), 1, &["is not empty", "--overwrite"]);
+    assert_eq!(files(dir.path()).len(), 1);
+    run(&format!("{} --overwrite", synth(dir.path())), 0);
+    assert_eq!(files(dir.path())["letter.txt"], b"mine");
+    run(&synth(&dir.path().join("new")), 0);
+    assert!(dir.path().join("new/transforms_train.json").is_file());
 }
 
 #[test]

@@ -226,9 +226,10 @@ impl Scene for Street {
         x.map(|x| DVec3::new(x, 0.62, 0.72)).collect()
     }
 
+    /// On the far lane, above the cars that are parked there.
     fn headlights(&self, center: DVec3, along: f64) -> [DVec3; 2] {
         let x = center.x + 1.6 * along - 0.8;
-        [0.24, 0.36].map(|y| DVec3::new(x, -y * center.y.signum(), 0.1))
+        [0.24, 0.36].map(|y| DVec3::new(x, -y * center.y.signum(), 0.2))
     }
 }
 
