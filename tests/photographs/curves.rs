@@ -284,7 +284,10 @@ fn curves_that_mix_channels_match_their_reference() {
 fn every_curve_goes_on_below_black_as_its_mirror_image() {
     let above = [1e-6_f32, 1e-3, 0.01, 0.05, 0.3, 0.9];
     let grid = [&above.map(|x| -x)[..], &[0.0], &above].concat();
-    for family in FAMILIES.iter().filter(|family| family.white != White::ChannelMeans) {
+    let is_of_one_value = |family: &&Family| {
+        family.white != White::ChannelMeans && family.curve != ToneCurve::LumPreserve
+    };
+    for family in FAMILIES.iter().filter(is_of_one_value) {
         let mut tone = ToneParameters { white: 0.4, offset: 0.1, gain: 0.8, ..Default::default() };
         (tone.weight, tone.constants[0]) = (1.0, 0.0);
         for (padded, constant) in tone.constants.iter_mut().zip(family.defaults()) {

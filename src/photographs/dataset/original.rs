@@ -28,6 +28,8 @@ pub struct Original {
     orientation: Orientation,
     /// Levels of a photograph's file.
     pub(super) levels: Levels,
+    /// The size that a photograph of linear light is shrunk to before it is tone-mapped.
+    pub(super) light_size: Option<(u32, u32)>,
     /// White balance of a photograph.
     pub(super) gains: Option<WhiteBalanceGains>,
     /// As [`super::LoadOptions::falloff`], of a photograph.
@@ -48,6 +50,7 @@ impl Original {
             undistort,
             orientation: turns.loading,
             levels: Levels::default(),
+            light_size: None,
             gains: None,
             falloff: None,
             measured: None,
@@ -56,9 +59,9 @@ impl Original {
         }
     }
 
-    /// Width and height after undistortion.
+    /// Width and height at which it is tone-mapped, after undistortion.
     pub(super) fn size(&self) -> UVec2 {
-        UVec2::new(self.lens.width, self.lens.height)
+        self.light_size.unwrap_or((self.lens.width, self.lens.height)).into()
     }
 
     /// Keeps the photograph at its original size in memory.
@@ -71,7 +74,7 @@ impl Original {
         let stored = self.stored.lock().unwrap_or_else(PoisonError::into_inner);
         match &*stored {
             Some(packed) => Ok(packed.image()),
-            None => self.load_at((self.lens.width, self.lens.height)),
+            None => self.load_at(self.size().into()),
         }
     }
 
@@ -84,8 +87,11 @@ impl Original {
         if let Some(gains) = self.gains {
             gains.apply(&mut image);
         }
-        let image = preparation.photograph(image.turned(self.orientation), path, self.falloff)?;
-        Ok(preparation.shrunk(image))
+        let whole = preparation.photograph(image.turned(self.orientation), path, self.falloff)?;
+        Ok(match self.light_size {
+            Some(_) => preparation.shrunk_in_light(whole),
+            None => preparation.shrunk(whole),
+        })
     }
 
     /// The statistics at a size, if they were measured while the photograph was decoded.

@@ -303,6 +303,8 @@ struct DecodedPicture {
     image: Image,
     alpha: Option<Image>,
     turns: Turns,
+    /// Whether the file holds linear light.
+    is_light: bool,
 }
 
 /// The pixels of a photograph or reference image as loaded, and its file if these are not all of it.
@@ -335,7 +337,7 @@ impl ViewLoader<'_> {
         let picture = photograph.as_ref().or(reference.as_ref());
         let orientation = picture.map(|picture| picture.turns.viewing).unwrap_or_default();
         let stored_mask = match picture {
-            Some(DecodedPicture { path, image, alpha, turns }) => {
+            Some(DecodedPicture { path, image, alpha, turns, .. }) => {
                 let decoded = (image, alpha.as_ref());
                 let stored = Mask::over(path, decoded, mask.as_ref(), options.invert_masks)?;
                 let stored = loading.borders.hide_borders(stored, (image.width, image.height));
@@ -395,8 +397,9 @@ impl ViewLoader<'_> {
         if let Ok(file) = &file {
             check_size(&path, file, turns, lens)?;
         }
+        let is_light = file.as_ref().is_ok_and(|file| file.is_light(&colours.levels()));
         match file.and_then(|file| file.decode_counted(colours)) {
-            Ok((image, alpha)) => Ok(Some(DecodedPicture { path, image, alpha, turns })),
+            Ok((image, alpha)) => Ok(Some(DecodedPicture { path, image, alpha, turns, is_light })),
             Err(error) => {
                 problems.push(error.to_string());
                 Ok(None)
@@ -413,8 +416,9 @@ impl ViewLoader<'_> {
     ) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
-        let DecodedPicture { path, image, turns, .. } = decoded;
+        let DecodedPicture { path, image, turns, is_light, .. } = decoded;
         let whole = preparation.photograph(image.turned(turns.loading), &path, options.falloff)?;
+        let whole = if is_light { preparation.shrunk_in_light(whole) } else { whole };
         let is_shrunk = preparation.size != (whole.width, whole.height);
         let is_kept = options.keep != Some(0);
         if is_kept && !is_shrunk {
@@ -423,6 +427,7 @@ impl ViewLoader<'_> {
         let mut original = Original::new(path, *preparation.lens, options.undistort, turns);
         (original.gains, original.falloff) = (loading.gains, options.falloff);
         original.levels = loading.colours[0].levels();
+        original.light_size = is_light.then_some(preparation.size);
         let measured = |image: &Image| match mask {
             Some(mask) => MeasuredPhotograph::measure(&mask.counted(image)),
             None => MeasuredPhotograph::measure(&image.data),

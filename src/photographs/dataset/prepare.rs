@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use glam::{DAffine3, DVec2};
+use rayon::prelude::*;
 
 use super::turns::Turns;
 use super::undistort::Undistortion;
@@ -77,6 +78,18 @@ impl<'a> Preparation<'a> {
     pub(super) fn shrunk(&self, image: Image) -> Image {
         let (width, height) = self.size;
         if (image.width, image.height) == self.size { image } else { image.resized(width, height) }
+    }
+
+    /// As [`Self::shrunk`], by the mean of linear light. Encoding and tone curves bend within the noise of a dark sensor:
+    /// what is averaged after them is too dark.
+    pub(super) fn shrunk_in_light(&self, mut image: Image) -> Image {
+        if (image.width, image.height) == self.size {
+            return image;
+        }
+        image.data.par_iter_mut().for_each(|x| *x = linear_from_srgb(*x));
+        let mut image = self.shrunk(image);
+        image.data.par_iter_mut().for_each(|x| *x = srgb_from_linear(*x));
+        image
     }
 
     pub(super) fn undistorted(&self, image: Image) -> Image {

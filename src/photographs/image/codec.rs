@@ -44,6 +44,11 @@ impl PictureFile {
         size_of_reader(&self.path, reader.map_err(|error| unreadable(&self.path, &error))?)
     }
 
+    /// Whether it holds linear light at these levels.
+    pub(crate) fn is_light(&self, levels: &Levels) -> bool {
+        is_raw(&self.path) || self.bytes.starts_with(&exr_file::MAGIC) || levels.are_linear()
+    }
+
     /// Its Exif orientation.
     pub(crate) fn orientation(&self) -> Orientation {
         Orientation::read(&mut Cursor::new(self.bytes.as_slice()))

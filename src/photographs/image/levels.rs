@@ -5,8 +5,8 @@
 //!
 //! - **16 bits, of which 10, 12 or 14 are used.** No value exceeds the largest code of so many bits, and in half of the
 //!   photographs the largest is in its last hundredth, where a sensor clips: dark photographs of the full scale end at
-//!   any value. Or 99 % of every photograph is below 2 of 255, black if it were encoded: then the fewest bits that hold
-//!   all values are right up to a gain, which the exposure of the targets takes back. Multiples of 257 are 8 bits, and
+//!   any value. Or 99 % of every photograph is below 2 of 255, black if it were encoded: then of the numbers of bits that
+//!   hold all values, that by which the median is nearest to that of dark photographs. Multiples of 257 are 8 bits, and
 //!   are as dark as they say.
 //! - **16 bits, of which a few per cent are used, far from black**, as thermal cameras count hundredths of kelvin: the
 //!   range is stretched, since its lower end is no black.
@@ -114,8 +114,9 @@ const TOP: f32 = 0.01;
 const ENCODED_BLACK: f32 = 2.0 / 255.0;
 /// At most this part of the scale of 16 bits is a narrow range, if it lies farther from 0 than it is wide.
 const NARROW: f32 = 0.05;
-/// The median of a dark photograph in linear light, four stops below middle grey.
-const DARK: f32 = MIDDLE_GREY / 16.0;
+/// The median of a dark photograph in linear light. Four times as much costs 3 dB: dark contrasts lie where the encoding
+/// bends.
+const DARK: f32 = MIDDLE_GREY / 40.0;
 
 impl Levels {
     /// The levels as the formats say.
@@ -293,6 +294,9 @@ impl FoundLevels {
             photographs.iter().filter(|one| is(one)).count()
         };
         let most = photographs.iter().fold(0.0, |most, one| one.most.max(most));
+        let mut medians: Vec<f32> = photographs.iter().map(|one| one.quantiles[1]).collect();
+        medians.sort_unstable_by(f32::total_cmp);
+        let median = medians[medians.len() / 2];
         let has_several = photographs.len() >= NEEDED;
         let limits = |black, white| Some(Self { format, black, white, are_limits: true });
         match format {
@@ -302,19 +306,21 @@ impl FoundLevels {
                 is_video.then(|| limits(VIDEO[0], VIDEO[1])).flatten()
             }
             SampleFormat::Sixteen => {
-                let bits = SENSOR_BITS.into_iter().find(|&bits| most <= largest_of(bits));
-                let white = bits.map(largest_of);
-                let reach = |white: f32| count(&|one| one.most >= (1.0 - TOP) * white);
+                let whites = SENSOR_BITS.into_iter().map(largest_of).filter(|white| most <= *white);
+                let reached = whites.clone().next().filter(|white| {
+                    let reach = count(&|one| one.most >= (1.0 - TOP) * white);
+                    has_several && 2 * reach >= photographs.len()
+                });
                 let black = count(&|one| one.quantiles[2] < ENCODED_BLACK * format.largest());
-                let is_white = |white: &f32| {
-                    has_several && 2 * reach(*white) >= photographs.len()
-                        || black == photographs.len()
-                };
+                // As dark as dark photographs are.
+                let off = |white: &f32| (median.max(0.5) / white / DARK).ln().abs();
+                let usual = whites.min_by(|a, b| off(a).total_cmp(&off(b)));
+                let white = reached.or(usual.filter(|_| black == photographs.len()));
                 let low = photographs.iter().fold(f32::MAX, |low, one| one.quantiles[0].min(low));
                 let high = photographs.iter().fold(0.0, |high, one| one.quantiles[3].max(high));
                 let range = high - low;
                 let is_narrow = range > 0.0 && range <= NARROW * format.largest() && low > range;
-                match white.filter(is_white) {
+                match white {
                     _ if is_narrow => {
                         let (black, white) = (low.round(), high.round());
                         Some(Self { format, black, white, are_limits: false })
@@ -324,10 +330,6 @@ impl FoundLevels {
                 }
             }
             SampleFormat::Float => {
-                let mut medians: Vec<f32> =
-                    photographs.iter().map(|one| one.quantiles[1]).collect();
-                medians.sort_unstable_by(f32::total_cmp);
-                let median = medians[medians.len() / 2];
                 let white = median / DARK;
                 (median > 1.0).then_some(Self { format, black: 0.0, white, are_limits: false })
             }
@@ -345,8 +347,8 @@ mod tests {
 
     /// Photographs of 64 x 64 in 8 or 16 bits, of codes by photograph and pixel.
     struct Set {
-        _folder: tempfile::TempDir,
         paths: Vec<PathBuf>,
+        _folder: tempfile::TempDir,
     }
 
     impl Set {
@@ -366,7 +368,7 @@ mod tests {
                 path
             };
             let paths = (0..count).map(path).collect();
-            Self { _folder: folder, paths }
+            Self { paths, _folder: folder }
         }
 
         fn levels(&self, light: Option<StoredLight>) -> Levels {
@@ -398,9 +400,9 @@ mod tests {
         for (bits, white) in [(10, 1023.0), (12, 4095.0), (14, 16_383.0)] {
             assert_eq!(found(&clipped(bits)), Some([0.0, white]), "{bits} bits");
         }
-        assert_eq!(found(&|one, at| dark(one, at, 80)), Some([0.0, 1023.0]));
+        assert_eq!(found(&|one, at| dark(one, at, 40)), Some([0.0, 1023.0]));
         assert_eq!(
-            found(&|one, at| dark(one, at, 450) + if at == 9 { 1500 } else { 0 }),
+            found(&|one, at| dark(one, at, 150) + if at == 9 { 1500 } else { 0 }),
             Some([0.0, 4095.0])
         );
         // Dark, encoded on the full scale, with any largest value below 4095; 8 bits in 16; bright.
@@ -409,7 +411,7 @@ mod tests {
         assert_eq!(found(&|one, at| dark(one, at, 65_000)), None);
         // One photograph that is not of the first that are looked at has more.
         let beyond =
-            Set::new(17, true, |one, at| dark(one, at, 80) + if one == 1 { 1000 } else { 0 });
+            Set::new(17, true, |one, at| dark(one, at, 40) + if one == 1 { 1000 } else { 0 });
         assert_eq!(beyond.found(), None);
         let some = Levels::of_set(None, beyond.paths.iter().map(|path| (path.as_path(), None)));
         let photograph = |at: usize| {
@@ -419,7 +421,7 @@ mod tests {
             (image, colours.is_beyond())
         };
         assert!(photograph(1).1 && !photograph(2).1);
-        assert!((photograph(2).0.data[0] - dark(2, 0, 80) as f32 / 1023.0).abs() < 1e-6);
+        assert!((photograph(2).0.data[0] - dark(2, 0, 40) as f32 / 1023.0).abs() < 1e-6);
     }
 
     #[test]

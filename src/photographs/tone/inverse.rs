@@ -263,7 +263,10 @@ mod tests {
             ToneParameters { white: 0.05, offset: 0.075, gain: 1.0, weight: 1.0, constants };
         let inverse = InverseTone::of_curve(CURVE_AUTO, None, &parameters);
         for rgb in colours() {
-            let back = inverse.invert(inverse.target(rgb)).rgb;
+            let Inverted { rgb: back, is_clipped } = inverse.invert(inverse.target(rgb));
+            if is_clipped {
+                continue;
+            }
             for (value, back) in rgb.into_iter().zip(back) {
                 let bound = 1e-3 * value + 1.0 / 65_535.0;
                 assert!((back - value).abs() < bound, "{rgb:?}: {value} becomes {back}");
