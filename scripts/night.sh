@@ -4,11 +4,10 @@
 #     scripts/night.sh [--train] [KIND...]
 #
 # A kind is `plain`, or options of `nightsplat synth` joined by +, such as street+sky; without one, those of
-# docs/night.md, which has the columns, in about three minutes on two cores. --train adds the PSNR of a training.
+# docs/night.md, in about three minutes on two cores. --train adds the PSNR of a training of STEPS (150) steps.
 #
 # NIGHTSPLAT    the command (default: target/release/nightsplat, built first)
 # SETS          the folder of the sets, in which they are kept and reused (default: a temporary folder)
-# STEPS         of a training (150)
 set -euo pipefail
 cd "$(dirname "$0")/.."
 if [ -z "${NIGHTSPLAT:-}" ]; then
@@ -45,8 +44,7 @@ def rows(png): # of bytes, of an 8-bit RGB image
             row[i] = row[i] + (0, a, b, (a + b) // 2, paeth)[kind] & 255
         above = row
         yield row
-def images(folder):
-    return [b"".join(rows(path.read_bytes())) for path in sorted(folder.glob("*.png"))]
+images = lambda folder: [b"".join(rows(path.read_bytes())) for path in sorted(folder.glob("*.png"))]
 def light(images):
     values = b"".join(images)
     planes = zip((0.2126, 0.7152, 0.0722), (values[channel::3] for channel in range(3)))
@@ -55,7 +53,7 @@ targets, right, found = images(scratch / "targets"), images(references), read("d
 pairs = zip(b"".join(targets), b"".join(right), strict=True)
 psnr = 10 * math.log10(255 ** 2 / mean([(a - b) ** 2 for a, b in pairs]))
 (luminance, white), (luminance_right, white_right) = light(targets), light(right)
-lines = [line.strip().removeprefix("WARN ") for line in (scratch / "lines").read_text().splitlines()]
+lines = [line[6:] for line in (scratch / "lines").read_text().splitlines() if line.startswith(" WARN ")]
 said = ["curve " + ("on" if found["plan"]["curve"]["on"] else "off"), *dict.fromkeys(lines), *found["remarks"]]
 cells = [kind, f"{psnr:.2f}", f"{luminance:.3f} ({luminance_right:.3f})",
          f"{white:.1f} ({white_right:.1f})", f"{read('applied')['exposure']['gain']:.1f}", "; ".join(said)]
@@ -70,12 +68,14 @@ for kind; do
     set=${SETS:-$scratch/sets}/$kind
     read -r -a options <<< "$(sed -E 's/^|\+/ --/g; s/--plain//; s/--street( |$)/--street 3\1/' <<< "$kind")"
     [ -d "$set" ] || "$NIGHTSPLAT" synth "$set" "${options[@]}" > /dev/null
-    "$NIGHTSPLAT" tone apply "$set" --out "$scratch/targets" --json > "$scratch/applied" 2> "$scratch/lines"
-    "$NIGHTSPLAT" diagnose "$set" --json > "$scratch/diagnosis" 2>> "$scratch/lines"
-    if [ -n "$training" ]; then
-        "$NIGHTSPLAT" train "$set" --out "$scratch/run" --overwrite --steps "${STEPS:-150}" --progress none > /dev/null
-        "$NIGHTSPLAT" eval "$scratch/run" --json > "$scratch/scores"
-    fi
+    {
+        "$NIGHTSPLAT" tone apply "$set" --out "$scratch/targets" --json > "$scratch/applied"
+        "$NIGHTSPLAT" diagnose "$set" --json > "$scratch/diagnosis"
+        if [ -n "$training" ]; then
+            "$NIGHTSPLAT" train "$set" --out "$scratch/run" --steps "${STEPS:-150}" --overwrite > /dev/null
+            "$NIGHTSPLAT" eval "$scratch/run" --json > "$scratch/scores"
+        fi
+    } 2> "$scratch/lines"
     row "$kind" "$set/high" "$scratch"
     rm -r "$scratch/targets"
 done
