@@ -265,8 +265,8 @@ fn the_histogram_has_the_mean_of_the_statistics() {
     }
 }
 
-/// A grey photograph of a dark room: a third each dark, middle and bright.
-fn room(pixels: usize) -> Vec<f32> {
+/// A grey photograph of a dark scene: a third each dark, middle and bright.
+fn evenly_lit(pixels: usize) -> Vec<f32> {
     let level = |i: usize| [0.02, 0.04, 0.08][i % 3] * (1.0 + 0.1 * (i % 7) as f32);
     (0..3 * pixels).map(|i| level(i % pixels)).collect()
 }
@@ -281,7 +281,7 @@ fn with_share(planes: &[f32], share: f64, level: f32) -> Vec<f32> {
 
 #[test]
 fn a_night_sky_stays_black_and_does_not_whiten_the_ground() {
-    let ground = room(30_000);
+    let ground = evenly_lit(30_000);
     let plain = exposure(std::slice::from_ref(&ground)).unwrap();
     assert_eq!(plain.ends, CurveEnds::default());
     let night = exposure(&[with_share(&ground, 0.6, 1.0 / 255.0)]).unwrap();
@@ -297,7 +297,7 @@ fn a_night_sky_stays_black_and_does_not_whiten_the_ground() {
 
 #[test]
 fn lamps_hardly_change_the_gain_and_a_window_bends_the_shoulder() {
-    let dark = room(30_000);
+    let dark = evenly_lit(30_000);
     let plain = exposure(std::slice::from_ref(&dark)).unwrap();
     for (share, least) in [(0.002, 0.95), (0.02, 0.75)] {
         let lamp = exposure(&[with_share(&dark, share, 1.0)]).unwrap();
@@ -316,7 +316,7 @@ fn lamps_hardly_change_the_gain_and_a_window_bends_the_shoulder() {
 
 #[test]
 fn lit_photographs_among_dark_ones_are_targets_and_set_the_brightness_of_the_others() {
-    let dark = room(30_000);
+    let dark = evenly_lit(30_000);
     let lit = scaled(&dark, 10.0);
     let views = [&dark, &lit, &dark, &lit, &dark].map(|view| LuminanceHistogram::new(view));
     let found = Exposure::measure(&views, None).unwrap();
@@ -340,7 +340,7 @@ fn lit_photographs_among_dark_ones_are_targets_and_set_the_brightness_of_the_oth
 
 #[test]
 fn a_photograph_of_one_channel_has_the_brightness_of_that_channel() {
-    let grey = room(30_000);
+    let grey = evenly_lit(30_000);
     let mut green = vec![0.0; grey.len()];
     green[30_000..60_000].copy_from_slice(&grey[30_000..60_000]);
     let [grey, green] = [grey, green].map(|planes| exposure(&[planes]).unwrap());

@@ -320,7 +320,7 @@ mod tests {
                 match (has_text && y >= 80, x) {
                     (false, _) => scene(x + shift * view, y + shift * view),
                     // The digits at the end change.
-                    (true, 64..96) => text(x + view, y),
+                    (true, 64..94) if (83..93).contains(&y) => text(x + view, y),
                     (true, ..64) if (83..93).contains(&y) => text(x, y),
                     (true, _) => 0.0,
                 }
