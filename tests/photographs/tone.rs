@@ -114,12 +114,12 @@ fn the_f32_curves_agree_with_the_f64_curves() {
 }
 
 #[test]
-fn nan_and_negative_values_map_into_the_range() {
+fn nan_and_negative_values_map_into_the_range_and_below_black() {
     for curve in ToneCurve::ALL {
         let parameters = ToneSettings::new(curve).parameters(&Statistics::new(&[0.1; 12]));
         for x in [f32::NAN, f32::NEG_INFINITY, -1.0, -1e-9, f32::INFINITY, f32::MAX] {
-            let y = curve.apply(x, &parameters);
-            assert!((0.0..=1.0).contains(&y), "{curve}({x}) = {y}");
+            let (y, least) = (curve.apply(x, &parameters), if x < 0.0 { -1.0 } else { 0.0 });
+            assert!((least..=1.0).contains(&y), "{curve}({x}) = {y}");
         }
         // As a black value, or black.
         let of_nan = curve.apply(f32::NAN, &parameters);
@@ -227,8 +227,8 @@ fn degenerate_photographs_have_finite_curves() {
                 "{name}: {parameters:?}"
             );
             for x in planes.iter().copied().chain([0.0, 0.5, 1.0]) {
-                let y = curve.apply(x, &parameters);
-                assert!((0.0..=1.0).contains(&y), "{name}: {curve}({x}) = {y}");
+                let (y, least) = (curve.apply(x, &parameters), if x < 0.0 { -1.0 } else { 0.0 });
+                assert!((least..=1.0).contains(&y), "{name}: {curve}({x}) = {y}");
             }
         }
     }

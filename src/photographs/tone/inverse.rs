@@ -116,7 +116,8 @@ impl InverseTone {
     fn solved(&self, value: f64, channel: usize, factor: f64) -> f64 {
         let black = self.black(channel);
         if value < black {
-            let mirror = (2.0 * black - value).min(self.largest[channel]);
+            // At least black, also of a curve that hardly rises.
+            let mirror = (2.0 * black - value).min(self.largest[channel]).max(black);
             return -self.solved(mirror, channel, factor);
         }
         // Written so that a NaN is black.

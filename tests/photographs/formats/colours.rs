@@ -50,8 +50,10 @@ fn photographs_and_references_become_srgb_and_masks_do_not() {
     let (_, message) = run(&format!("tone apply {}", root.display()), 0);
     let lines: Vec<&str> =
         message.lines().filter(|line| line.contains("converted to sRGB")).collect();
-    assert_eq!(lines.len(), 1, "{message}");
-    assert!(lines[0].contains("photographs in sRGB at gamma 1.00"), "{message}");
+    assert_eq!(lines.len(), 2, "{message}");
+    for (line, objects) in lines.iter().zip(["photographs", "reference images"]) {
+        assert!(line.contains(&format!("{objects} in sRGB at gamma 1.00")), "{message}");
+    }
 }
 
 #[test]
