@@ -21,6 +21,8 @@ pub(crate) mod files;
 #[cfg(feature = "io")]
 mod jpeg;
 #[cfg(feature = "io")]
+mod level_search;
+#[cfg(feature = "io")]
 mod levels;
 #[cfg(feature = "io")]
 mod mask;
@@ -68,7 +70,7 @@ fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
 /// Middle grey in linear light: the mean of a photograph that is exposed by a light meter.
 pub const MIDDLE_GREY: f32 = 0.18;
 
-/// The sRGB encoding of a linear-light value; inverse of [`linear_from_srgb`]. It is odd: noise at black keeps its mean.
+/// The sRGB encoding of a linear-light value; inverse of [`linear_from_srgb`]. It is odd: noise at black has no bias.
 pub fn srgb_from_linear(linear: f32) -> f32 {
     let light = linear.abs();
     let encoded =

@@ -11,11 +11,11 @@
 //! auto    delta + (1 - delta) [(1 - lambda) s(x) + lambda x s(Y) / Y]    s(x) = 1 - exp(-k x), delta = 0.075
 //! ```
 //!
-//! clamped to [0, 1] for x from 0 on, and T(-x) = 2 T(0) - T(x) below 0, where t = x / p90, Y is the mean luminance, and the black level delta0 = alpha (1 - p10 /
-//! p90)^beta is high if shadows are crushed. The statistics are those of one photograph, or means over a scene
-//! ([`Statistics`]). In the automatic curve, Y is the pixel's luminance, and the gain k follows from the luminance of
-//! all photographs ([`Exposure`]); the gain of every other curve can, too. [`FAMILIES`] is the table of all curves; a
-//! [`Table`] of values from a file and a camera [`Profile`] are curves, too.
+//! clamped to [0, 1] for x from 0 on, and T(-x) = 2 T(0) - T(x) below 0, where t = x / p90, Y is the mean luminance,
+//! and the black level delta0 = alpha (1 - p10 / p90)^beta is high if shadows are crushed. The statistics are those of
+//! one photograph, or means over a scene ([`Statistics`]). In the automatic curve, Y is the pixel's luminance, and the
+//! gain k follows from the luminance of all photographs ([`Exposure`]); the gain of every other curve can, too.
+//! [`FAMILIES`] is the table of all curves; a [`Table`] of values from a file and a camera [`Profile`] are curves, too.
 
 #[cfg(feature = "io")]
 mod curve;

@@ -96,10 +96,10 @@ pub struct TrainConfig {
     invert_masks: bool = false => Rule::Flag, "--invert-masks";
     /// Mask black borders and corners that the photographs have in the same place, as undistorting leaves them.
     mask_borders: bool = true => Rule::Flag;
-    /// How the integer files of the photographs store light: srgb, as their formats say, or linear, as RAW converters and
-    /// machine vision write sensor values; with srgb, levels are those of the format. Without either, files count as
-    /// sRGB, with the levels that all of them together show: 10, 12 or 14 of 16 bits, the range of video, or a narrow
-    /// range, and in float files a unit of their own.
+    /// How the integer files of the photographs store light: srgb, as their formats say, or linear, as RAW converters
+    /// and machine vision write sensor values; with srgb, levels are those of the format. Without either, files count
+    /// as sRGB, with the levels that all of them together show: 10, 12 or 14 of 16 bits, the range of video, or a
+    /// narrow range, and in float files a unit of their own.
     light: Option<StoredLight> = None, "srgb, and levels that the values show"
         => Rule::OneOf(&StoredLight::NAMES), "--light LIGHT";
     /// Mask what hardly changes between views that move, such as a date burnt into every photograph, with the black bar

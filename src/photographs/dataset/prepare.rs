@@ -80,8 +80,8 @@ impl<'a> Preparation<'a> {
         if (image.width, image.height) == self.size { image } else { image.resized(width, height) }
     }
 
-    /// As [`Self::shrunk`], by the mean of linear light. Encoding and tone curves bend within the noise of a dark sensor:
-    /// what is averaged after them is too dark.
+    /// As [`Self::shrunk`], by the mean of linear light: encoding and tone curves bend within the noise of a sensor, so
+    /// that what is averaged after them is too dark.
     pub(super) fn shrunk_in_light(&self, mut image: Image) -> Image {
         if (image.width, image.height) == self.size {
             return image;

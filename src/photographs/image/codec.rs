@@ -63,7 +63,9 @@ impl PictureFile {
     /// [`Self::decode`] that counts colour conversions in `counters` instead of logging them.
     pub(crate) fn decode_counted(self, counters: &ColourCounts) -> Result<(Image, Option<Image>)> {
         let decoded = decode(&self.path, self.bytes, Meaning::Colour, &counters.levels())?;
-        Ok(counters.add(&self.path, decoded))
+        let DecodedImage { image, alpha, conversion, is_beyond, remark, .. } = decoded;
+        counters.add(&self.path, conversion, remark, is_beyond);
+        Ok((image, alpha))
     }
 
     /// The values as parts of the scale of their format; of camera RAW, which has none, as photographs have them.

@@ -59,8 +59,8 @@ pub(super) fn convert(image: &mut Image, bytes: &[u8]) -> Conversion {
     Conversion { from: None, unknown }
 }
 
-/// Converts linear light of other primaries to those of sRGB. Negative values are kept: those of noise at black have to,
-/// and others say the same of a colour outside sRGB.
+/// Converts linear light of other primaries to those of sRGB. Negative values are kept: those of noise at black, and of
+/// colours outside sRGB.
 pub(super) fn convert_linear(image: &mut Image, chromaticities: Chromaticities) -> Conversion {
     /// A code value of 8 bits near black.
     const MARGIN: f64 = 1.0 / 255.0 / 12.92;

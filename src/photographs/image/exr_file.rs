@@ -17,8 +17,8 @@ use crate::{Error, Result};
 /// The magic number of EXR files.
 pub(super) const MAGIC: [u8; 4] = [0x76, 0x2F, 0x31, 0x01];
 
-/// The first layer's R, G and B (or Y), and the mask of its finite pixels. Colours are encoded as sRGB, with their sign;
-/// those that are not finite become 0, and are counted in a remark.
+/// The first layer's R, G and B (or Y), and the mask of its finite pixels. Colours are encoded as sRGB, with their
+/// sign; those that are not finite become 0, and are counted in a remark.
 pub(super) fn load(
     path: &Path,
     bytes: Vec<u8>,
@@ -108,8 +108,8 @@ fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>
     Ok((Image { width, height, data }, chromaticities))
 }
 
-/// What precedes the names of red, green and blue: nothing, or that of the only group of channels that has all three, or
-/// of the only one that is called `Combined`, as Blender calls the picture.
+/// What precedes the names of red, green and blue: nothing, or the name of the only group of channels that has all
+/// three, or of the only one that is called `Combined`, as Blender calls the picture.
 fn group(names: &[String]) -> &str {
     let has = |name: String| names.contains(&name);
     let is_whole = |group: &&str| ["G", "B"].iter().all(|color| has(format!("{group}{color}")));

@@ -1,9 +1,9 @@
 //! Camera RAW: sensor values in linear light, white-balanced as by the camera, in the primaries of sRGB.
 //!
 //! Light stays linear: noise keeps its sign below black, where a cut would raise the mean of what is dark, and white
-//! balance would colour it. So rawler, whose purpose is a picture, decodes and demosaics only; levels, white balance and
-//! matrix are here. A highlight is clipped where a channel is at the sensor's white: its channels are limited to the
-//! smallest white of a channel after white balance, so that it is white and not magenta. Others keep their light.
+//! balance would colour it. So rawler, whose purpose is a picture, decodes and demosaics only; levels, white balance
+//! and matrix are here. A highlight is clipped where a channel is at the sensor's white: its channels are limited to
+//! the smallest white of a channel after white balance, so that it is white, not magenta. Others keep their light.
 
 use std::panic::catch_unwind;
 use std::path::Path;

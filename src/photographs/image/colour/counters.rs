@@ -5,8 +5,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
-use super::super::Image;
-use super::super::decoded::DecodedImage;
 use super::super::levels::Levels;
 use super::Conversion;
 
@@ -62,19 +60,19 @@ impl ColourCounts {
         self.counts.lock().unwrap_or_else(PoisonError::into_inner).is_beyond
     }
 
-    /// Counts a photograph; returns its pixels and alpha.
+    /// Counts a photograph.
     pub(in super::super) fn add(
         &self,
         path: &Path,
-        decoded: DecodedImage,
-    ) -> (Image, Option<Image>) {
-        let DecodedImage { image, alpha, conversion, is_beyond, remark, .. } = decoded;
+        conversion: Conversion,
+        remark: Option<String>,
+        is_beyond: bool,
+    ) {
         let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
         counts.is_beyond |= is_beyond;
         counts.remarks.extend(remark.map(|remark| format!("{}: {remark}", path.display())));
         drop(counts);
         self.count(conversion);
-        (image, alpha)
     }
 
     /// Counts a conversion.
