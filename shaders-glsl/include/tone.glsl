@@ -24,7 +24,7 @@ float shoulder(float t, ToneParameters tone) {
     return one_minus_exp(s > 0.0 ? log_1p(s * t) / s : t);
 }
 
-// The toe of the automatic curve: from the black level to 0, and from constants[2] to itself; constants[3] is its weight.
+// The toe of the automatic curve: from the black level to 0, and from constants[2] to itself, with weight constants[3].
 float toe(float value, ToneParameters tone) {
     float end = tone.constants[2];
     float weight = tone.constants[3];

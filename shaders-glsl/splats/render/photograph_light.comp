@@ -7,9 +7,9 @@
 //!
 //! Colours are weighted by alpha, so the colour before that is c / alpha. A curve that maps each value by itself is
 //! inverted by bisection. `auto` also depends on the luminance Y of the pixel, by s(Y) / Y: for a given Y, a channel is
-//! a concave curve below a toe, whose inverse Newton's method finds from the left; bracketed, it also finds the Y that its own
-//! result has. Values within half a code of 8 bits of the largest that a curve gives become those of that limit. The
-//! host's inverse is `src/photographs/tone/inverse.rs`.
+//! a concave curve below a toe, whose inverse Newton's method finds from the left; bracketed, it also finds the Y that
+//! its own result has. Values within half a code of 8 bits of the largest that a curve gives become those of that
+//! limit. The host's inverse is `src/photographs/tone/inverse.rs`.
 
 layout(local_size_x = 64) in;
 
