@@ -245,12 +245,12 @@ mod tests {
         let exposure =
             |brightness| Exposure::measure([&ramp(0.0, 0.5).luminance], Some(brightness)).unwrap();
         let all = [ramp(0.0, 0.5), photograph(&[(1.0, 1000)])];
-        let share = brought_near_white(&all[..1], &exposure(0.6));
+        let share = brought_near_white(&all[..1], &exposure(0.75));
         let white = (0..1000).filter(|&index| {
-            soft(0.5 * f64::from(index) / 999.0, exposure(0.6).gain) >= f64::from(NEAR_WHITE)
+            soft(0.5 * f64::from(index) / 999.0, exposure(0.75).gain) >= f64::from(NEAR_WHITE)
         });
         assert!((share - white.count() as f64 / 1e3).abs() < 0.02 && share > 0.05, "{share}");
-        let both = brought_near_white(&all, &exposure(0.6));
+        let both = brought_near_white(&all, &exposure(0.75));
         assert!((both - share / 2.0).abs() < 1e-9, "white already");
         let text = findings(&all, None, share).join("");
         assert!(text.contains("near white") && text.contains("`--brightness 0.3`"), "{text}");
