@@ -35,6 +35,8 @@ use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 use geometry::SceneGeometry;
 pub(super) use geometry::exposures_at_points;
+#[cfg(feature = "cli")]
+pub(crate) use geometry::remarks_at_points;
 pub use lamp::{LampDiagnosis, falloff::FalloffDiagnosis};
 use lamp::{LampObservations, bands};
 pub use noise::ChannelNoise;

@@ -26,6 +26,7 @@ use crate::photographs::tone::{
 };
 use crate::results::eval;
 use crate::results::report::Distribution;
+use crate::train::diagnose::remarks_at_points;
 use crate::train::{RequestedSettings, TrainConfig};
 use crate::{Error, Result};
 
@@ -291,7 +292,10 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     scene.gain = exposure.as_ref().map(|exposure| exposure.gain);
     let with_reference = settings.knows_references();
     let near_white = scene.after.near_white_fraction - scene.before.near_white_fraction;
-    let remarks = findings(&set.measured, exposure.as_ref(), near_white);
+    let mut remarks = findings(&set.measured, exposure.as_ref(), near_white);
+    if Dataset::is_at(&args.input) {
+        remarks.extend(remarks_at_points(&TrainConfig { dataset: args.input.clone(), ..config }));
+    }
     let output = ToneOutput { curve: settings, with_reference, exposure, scene, remarks, views };
     if let (Some(page), Some(path)) = (page, &args.report) {
         page.write(path, &output)?;

@@ -28,7 +28,7 @@ const MAX_AREA: f64 = 0.25;
 const MIN_MOVED: f64 = 0.2;
 /// A line is a bar around the text if this share of its values is black.
 const BAR: f64 = 0.95;
-/// Beside static text, text that changes has at least this part of its contrast in every view.
+/// Beside static text, text that changes has at least this part of its contrast in half of the views.
 const LIVELY: f32 = 0.6;
 
 /// Pixels that an overlay covers.
@@ -103,9 +103,7 @@ pub(super) fn overlays<'a>(
     }
     let mut found = joined(areas, side, grid.width);
     found.retain(|overlay| overlay.cells >= MIN_CELLS);
-    found
-        .iter_mut()
-        .for_each(|overlay| OverlayViews { views: &views, grid, most }.fit(overlay, side));
+    found.iter_mut().for_each(|overlay| OverlayViews { views: &views, grid }.fit(overlay, side));
     let area: usize = found.iter().map(|one| one.rows.len() * one.columns.len()).sum();
     if area as f64 > MAX_AREA * grid.len() as f64 { vec![] } else { found }
 }
@@ -191,8 +189,6 @@ fn joined(mut found: Vec<Overlay>, cell: usize, width: usize) -> Vec<Overlay> {
 struct OverlayViews<'a> {
     views: &'a [&'a [f32]],
     grid: &'a PixelGrid,
-    /// The number of them that may differ.
-    most: usize,
 }
 
 impl OverlayViews<'_> {
@@ -213,7 +209,7 @@ impl OverlayViews<'_> {
             while let Some(next) = side.next(overlay, cell, (width, height)) {
                 let views = 0..self.views.len();
                 let dull = views.filter(|&view| self.contrast(&next, view) < LIVELY * contrast);
-                if dull.count() > self.most {
+                if 2 * dull.count() > self.views.len() {
                     break;
                 }
                 *overlay = overlay.joined(&next);
