@@ -13,6 +13,8 @@ mod lamp;
 mod noise;
 mod photograph;
 mod plan;
+#[cfg(feature = "cli")]
+mod remarks;
 mod sharpness;
 mod target_noise;
 
@@ -35,13 +37,13 @@ use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 use geometry::SceneGeometry;
 pub(super) use geometry::exposures_at_points;
-#[cfg(feature = "cli")]
-pub(crate) use geometry::remarks_at_points;
 pub use lamp::{LampDiagnosis, falloff::FalloffDiagnosis};
 use lamp::{LampObservations, bands};
 pub use noise::ChannelNoise;
 use photograph::PhotographStatistics;
 pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
+#[cfg(feature = "cli")]
+pub(crate) use remarks::remarks_at_points;
 pub use target_noise::TargetNoise;
 
 /// A view is reported as blurred from this many times the median, and this many pixels more.

@@ -5,14 +5,12 @@ use std::collections::BTreeMap;
 use glam::DVec2;
 use rayon::prelude::*;
 
-use super::lamp::{LampObservations, bands, falloff::FalloffDiagnosis};
 use crate::Result;
 use crate::camera::Camera;
-use crate::photographs::dataset::{Dataset, LoadOptions, MeasuredSize, Point, View};
+use crate::photographs::dataset::{Dataset, Point, View};
 use crate::photographs::image::{Image, linear_from_srgb};
 use crate::photographs::tone::{bounded, luminance};
 use crate::splats::scene::init;
-use crate::train::TrainConfig;
 
 /// Random points in front of the cameras if the dataset has none.
 const RANDOM_POINTS: usize = 2000;
@@ -199,32 +197,6 @@ pub(in crate::train) fn exposures_at_points(dataset: &Dataset) -> Result<BTreeMa
     let shared = SceneGeometry::measure(dataset, &views)?;
     let named = views.iter().zip(shared.exposures);
     Ok(named.filter_map(|((_, view), value)| Some((view.name.clone(), value?))).collect())
-}
-
-#[cfg(feature = "cli")]
-/// Remarks on rows and corners of a dataset's training photographs, at shared points; none if it cannot be loaded.
-pub(crate) fn remarks_at_points(config: &TrainConfig) -> Vec<String> {
-    let options = LoadOptions {
-        load_low_test: false,
-        mask_borders: false,
-        mask_overlays: false,
-        falloff: Some([0.0; 2]),
-        measured: MeasuredSize::None,
-        ..config.load_options()
-    };
-    // The files are listed, with warnings, before.
-    let unlogged = tracing::subscriber::NoSubscriber::default();
-    let load = || Dataset::load(&config.dataset, &options).ok();
-    let Some(dataset) = tracing::subscriber::with_default(unlogged, load) else { return vec![] };
-    let views: Vec<(usize, &View)> =
-        dataset.views.iter().enumerate().filter(|(_, view)| view.is_for_training()).collect();
-    let Ok(shared) = SceneGeometry::measure(&dataset, &views) else { return vec![] };
-    let Ok(tracks) = LampObservations::new(&shared.observations, views.len()) else {
-        return vec![];
-    };
-    let falloff = FalloffDiagnosis::new(&tracks, shared.corner);
-    let corners = falloff.is_found().then(|| falloff.why() + "; `train` evens them out");
-    bands::remark(&tracks).into_iter().chain(corners).collect()
 }
 
 /// Alternating medians: a point's brightness over its views, a view's exposure over its points. Only the brighter half
