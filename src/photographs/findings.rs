@@ -96,7 +96,7 @@ fn raised_black(all: &LuminanceHistogram) -> Option<String> {
 }
 
 fn extremes(all: &LuminanceHistogram) -> Option<String> {
-    let share = all.mean_of(|y| f64::from(u8::from(y < BLACK || y >= NEAR_WHITE)));
+    let share = all.mean_of(|y| f64::from(u8::from(!(BLACK..NEAR_WHITE).contains(&y))));
     (share >= MAX_EXTREME).then(|| {
         format!(
             "{:.1} % of the pixels are black or near white, lamps and night: no curve finds anything between; expose \
