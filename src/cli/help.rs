@@ -8,7 +8,7 @@ use crate::photographs::tone::Tone;
 use crate::train::{TrainConfig, values};
 
 /// The options of a command that `-h` shows; of a command that is not listed it shows all.
-const COMMON: [(&str, &str); 8] = [
+const COMMON: [(&str, &str); 9] = [
     ("train", "out resume overwrite preset steps curve downscale max-vram device view explain"),
     ("sweep", "out curves presets seeds grid table steps downscale jobs dry-run"),
     ("check", "json steps curve parts downscale device"),
@@ -16,6 +16,7 @@ const COMMON: [(&str, &str); 8] = [
     ("render", "out split path frames video size layer format dataset device"),
     ("apply", "out curve gain brightness reference report compare format json device"),
     ("fit", "normal family out cross-validate plot profile json"),
+    ("synth", "street views width height seed fisheye lamp sky street-lamp night-mode overwrite"),
     ("diagnose", "report plan run preset steps downscale json device"),
 ];
 

@@ -335,7 +335,9 @@ fn targets_of_linear_light_are_equally_bright_for_any_exposure() {
         let (darker, image) = target(0.5_f32.powi(stops));
         assert!(darker.gain > exposure.gain, "{stops}: {} {}", darker.gain, exposure.gain);
         let off = (darker.target - exposure.target).abs();
-        assert!(off < 0.03, "{stops}: {} {}", darker.target, exposure.target);
+        // On the linear part of sRGB's curve the contrast is higher, for which the rule's mean is lower, down to its
+        // bound.
+        assert!(off < 0.045, "{stops}: {} {}", darker.target, exposure.target);
         // The images differ: the darkest light is on the linear part of sRGB's curve, the rest on the power.
         let psnr = psnr(&image, &eighth).unwrap();
         assert!(psnr > 20.0, "{stops} stops below the light: {psnr} dB");
@@ -377,11 +379,11 @@ fn a_well_lit_folder_is_unchanged_and_a_black_one_refused() {
 fn the_automatic_curve_has_its_known_scores() {
     let Some(lom) = crate::common::shared("data/lom") else { return };
     let mut mean = 0.0;
-    for (scene, known) in [("chair", 25.82), ("sofa", 29.79), ("shrub", 18.86)] {
+    for (scene, known) in [("chair", 25.87), ("sofa", 30.04), ("shrub", 19.59)] {
         let output = apply(&automatic(&lom.join(scene), "")).unwrap();
         let psnr = output.scene.scores.unwrap().psnr;
         assert!((psnr - known).abs() < 0.05, "{scene}: {psnr}");
         mean += psnr / 3.0;
     }
-    assert!(mean >= 24.7, "{mean}");
+    assert!(mean >= 25.1, "{mean}");
 }

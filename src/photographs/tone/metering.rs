@@ -51,9 +51,10 @@ const LARGEST_SATURATION: f64 = 0.75;
 /// k Y below which a pixel of the whole counts as black.
 const BLACK: f64 = 0.2;
 
-/// Up to the first share of such pixels, all take part in the metering; from the second on, none of them. Evenly dark
-/// rooms have 0 to 0.35, a night sky 0.4 to 0.8.
-const BLACK_SHARES: [f64; 2] = [0.35, 0.5];
+/// Up to the first share of such pixels, all take part in the metering; from the second on, none of them. As many as are
+/// between [`BLACK`] and twice that do not count: they are shadows. Rooms have 0 to 0.2, a night sky its share of the
+/// frame.
+const BLACK_SHARES: [f64; 2] = [0.25, 0.35];
 
 /// The toe ends at this multiple of the luminance below which pixels count as black.
 const TOE: f64 = 2.0;
@@ -144,7 +145,10 @@ impl Metering {
         if brightness.is_some() {
             return whole;
         }
-        let shares = views.iter().map(|view| view.fraction_below(whole.black_of(view)));
+        let shares = views.iter().map(|view| {
+            let black = whole.black_of(view);
+            2.0 * view.fraction_below(black) - view.fraction_below(2.0 * black)
+        });
         let share = shares.sum::<f64>() / views.len().max(1) as f64;
         let [none, all] = BLACK_SHARES;
         Self { left_out: ((share - none) / (all - none)).clamp(0.0, 1.0), ..whole }
