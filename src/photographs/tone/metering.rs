@@ -51,8 +51,8 @@ const LARGEST_SATURATION: f64 = 0.75;
 /// k Y below which a pixel of the whole counts as black.
 const BLACK: f64 = 0.2;
 
-/// Up to the first share of such pixels, all take part in the metering; from the second on, none of them. As many as are
-/// between [`BLACK`] and twice that do not count: they are shadows. Rooms have 0 to 0.2, a night sky its share of the
+/// Up to the first share of such pixels, all take part in the metering; from the second on, none of them. As many as
+/// are between [`BLACK`] and twice that are shadows and do not count. Rooms have 0 to 0.2, a night sky its share of the
 /// frame.
 const BLACK_SHARES: [f64; 2] = [0.25, 0.35];
 
