@@ -319,7 +319,8 @@ for attempt in {1..20}; do
     [ "$attempt" = 1 ] || rm -r serial/model
     "$program" blocks join serial > "$scratch/join" 2>&1 &
     first=$!
-    until [ -e serial/.lock ] || [ ! -e "/proc/$first/exe" ]; do :; done
+    # The number is written once the lock is held.
+    until grep -qsx "$first" serial/.lock || [ ! -e "/proc/$first/exe" ]; do :; done
     kill -STOP "$first" 2>> "$log" || true
     [ -e serial/model/manifest.json ] || break
     kill -CONT "$first" 2>> "$log" || true

@@ -3,7 +3,7 @@
 //! In: image files, camera files, tone curves. Out: [`dataset::Dataset`], images, and pseudo-GT targets on the device.
 //!
 //! - [`image`]: float images and their files
-//! - [`white_balance`]: white balance set by the user
+//! - [`white_balance`]: white balance set by the user, also by a colour chart
 //! - [`metrics`]: PSNR and SSIM of a render against its reference image
 //! - [`tone`]: curves that brighten a photograph
 //! - [`fit`]: the constants of a curve from pairs of photographs
@@ -15,6 +15,7 @@
 //! - [`structure`]: the edges of a pseudo-GT that do not depend on its illumination
 
 #[cfg(feature = "io")]
+mod colour_chart;
 pub mod dataset;
 #[cfg(feature = "io")]
 pub mod findings;

@@ -49,7 +49,7 @@ use glam::DVec3;
 use crate::camera::Lens;
 use crate::photographs::image::files::PhotographFiles;
 use crate::photographs::image::{Levels, MaskFile};
-use crate::photographs::white_balance::{WhiteBalance, WhiteBalanceGains};
+use crate::photographs::white_balance::{WhiteBalance, WhiteBalanceMatrix};
 use crate::{Error, Result};
 pub(crate) use borders::Borders;
 pub use fingerprint::Fingerprint;
@@ -156,10 +156,10 @@ impl Dataset {
         let mut sources = sources(&layout.root, &frames, options, &files, &mut skipped);
         let headers = pixels::headers(&mut sources);
         let mut levels = levels(&layout, &sources, options, &files)?;
-        let gains = white_balance_gains(&layout.root, &sources, options, levels)?;
+        let balance = white_balance_matrix(&layout.root, &sources, options, levels)?;
         let files = (sources, headers);
         let views =
-            pixels::load(files, &layout, options, observer, &mut levels, gains, &mut skipped)?;
+            pixels::load(files, &layout, options, observer, &mut levels, balance, &mut skipped)?;
         if !views.iter().any(|view| view.split == Split::Train) {
             let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
             let problem = format!(
@@ -293,18 +293,18 @@ fn levels(
     Ok(of(&sources(&whole.root, &frames, options, files, &mut vec![])))
 }
 
-/// The gains of the photographs; `None` without a white balance.
-fn white_balance_gains(
+/// The white balance of the photographs, if there is one.
+fn white_balance_matrix(
     root: &Path,
     sources: &[ViewFiles],
     options: &LoadOptions,
     levels: Levels,
-) -> Result<Option<WhiteBalanceGains>> {
+) -> Result<Option<WhiteBalanceMatrix>> {
     let photographs = || {
         sources.iter().filter_map(|source| Some((source.name.as_str(), source.input.as_deref()?)))
     };
-    let gains = |balance: &WhiteBalance| balance.gains(root, photographs(), levels);
-    options.white_balance.as_ref().map(gains).transpose()
+    let balance = |balance: &WhiteBalance| balance.matrix(root, photographs(), levels);
+    options.white_balance.as_ref().map(balance).transpose()
 }
 
 /// The files of each view. A training view without its photograph is left out, a test view is kept as a pose.

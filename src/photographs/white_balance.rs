@@ -1,20 +1,22 @@
-//! White balance set by the user: a gain for each channel of the photographs.
+//! White balance set by the user: a gain for each channel of the photographs, and a matrix from a colour chart.
 //!
 //! ```text
-//! x' = encode(g decode(x))        g: gain of the channel; decode, encode: sRGB transfer functions
+//! x' = encode(M g decode(x))      g: gains; M: a chart's matrix; decode, encode: sRGB transfer functions
 //! ```
 //!
 //! The illuminant multiplies linear light, and so do the gains (von Kries), before measurements and before the tone
-//! curve: after a curve, a colour cast would depend on brightness. Values above 1 are kept until the curve clips them.
+//! curve: after a curve, a colour cast would depend on brightness. Values beyond 0 and 1 are kept until the curve clips
+//! them.
 
 use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat3, DVec3, Mat3, Vec3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::colour_chart::{self, FIRST_GREY, LUMINANCE, homography};
 use super::image::{ColourCounts, Image, Levels, linear_from_srgb, srgb_from_linear};
 use crate::{Error, Result};
 
@@ -28,14 +30,14 @@ pub enum WhiteBalance {
     Kelvin(f64),
     /// A grey card or another neutral area of a photograph as stored: the view, then x, y, width and height in pixels.
     Area(String, [u32; 4]),
-    /// The grey patches of a chart of 6 x 4 patches (ColorChecker): the view, then the corners of the chart as stored,
-    /// at the dark skin, bluish green, black and white patch, x and y in pixels.
+    /// A chart of 6 x 4 patches (ColorChecker): the view, then the corners of the chart as stored, at the dark skin,
+    /// bluish green, black and white patch, x and y in pixels.
     Chart(String, [[f64; 2]; 4]),
 }
 
-/// The gains of red, green and blue in linear light.
+/// The map of linear light: a row for each of red, green and blue of the balanced photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct WhiteBalanceGains(pub [f32; 3]);
+pub struct WhiteBalanceMatrix(pub [[f32; 3]; 3]);
 
 /// Colour temperatures within the range of the Planckian locus's approximation and the gamut of sRGB, kelvin.
 const TEMPERATURES: std::ops::RangeInclusive<f64> = 2000.0..=25_000.0;
@@ -49,16 +51,17 @@ impl WhiteBalance {
     pub(crate) const FORM: &'static str = "R,G,B of 0.001 to 1000, a colour temperature of 2000 to 25000 (kelvin), \
         VIEW,x,y,w,h of a neutral area in whole pixels, or VIEW,x1,y1,..,x4,y4, the corners of a colour chart";
 
-    /// The gains, measured in one of the named photographs of `root`, of these levels, if necessary.
-    pub(crate) fn gains<'a>(
+    /// The matrix, measured in one of the named photographs of `root`, of these levels, if necessary.
+    pub(crate) fn matrix<'a>(
         &self,
         root: &Path,
         photographs: impl IntoIterator<Item = (&'a str, &'a Path)>,
         levels: Levels,
-    ) -> Result<WhiteBalanceGains> {
+    ) -> Result<WhiteBalanceMatrix> {
+        let of_gains = |gains| Ok(WhiteBalanceMatrix::new(DMat3::from_diagonal(gains)));
         let view = match self {
-            Self::Gains(gains) => return Ok(WhiteBalanceGains(gains.map(|gain| gain as f32))),
-            Self::Kelvin(kelvin) => return Ok(neutralising(light(*kelvin) / light(NEUTRAL))),
+            Self::Gains(gains) => return of_gains(DVec3::from_array(*gains)),
+            Self::Kelvin(kelvin) => return of_gains(neutralising(light(*kelvin) / light(NEUTRAL))),
             Self::Area(view, _) | Self::Chart(view, _) => view,
         };
         let is_called = |(name, path): &(&str, &Path)| {
@@ -71,55 +74,97 @@ impl WhiteBalance {
             Error::input(root, problem)
         })?;
         let photograph = Image::load_counted(path, &ColourCounts::of_levels(levels))?;
-        let gains = neutralising(self.mean_of(&photograph)?);
-        let [red, green, blue] = gains.0;
+        let patches = self.light(&photograph)?;
+        let gains = neutralising(self.neutral(&patches)?);
+        let colours = match self {
+            Self::Chart(..) => self.colours(&patches, gains)?,
+            _ => DMat3::IDENTITY,
+        };
+        let rows = colours.transpose();
         tracing::info!(
-            "white balance from view {view}: gains {red:.3}, {green:.3}, {blue:.3} in linear light"
+            "white balance from view {view}: gains {gains:.3} in linear light{}",
+            if colours == DMat3::IDENTITY {
+                String::new()
+            } else {
+                format!(
+                    "; red {:.2}, green {:.2}, blue {:.2} of the balanced channels, by the colours of the chart",
+                    rows.x_axis, rows.y_axis, rows.z_axis
+                )
+            }
         );
-        Ok(gains)
+        Ok(WhiteBalanceMatrix::new(colours * DMat3::from_diagonal(gains)))
     }
 
-    /// The mean linear light of the neutral areas of a photograph.
-    fn mean_of(&self, image: &Image) -> Result<DVec3> {
+    /// The mean linear light of each patch and the number of its pixels; `None` for one that is mostly clipped.
+    fn light(&self, image: &Image) -> Result<Vec<Option<(DVec3, f64)>>> {
         /// Brighter values are clipped or almost clipped.
         const CLIPPED: f32 = 0.98;
-        /// A lower mean is black: half an 8-bit code value.
-        const BLACK: f64 = 0.5 / 255.0 / 12.92;
-        let refused = |problem: &str| Err(Error::Usage(format!("white balance {self}: {problem}")));
         let pixels = self.pixels();
         let is_inside = |&[x, y]: &[u32; 2]| x < image.width && y < image.height;
         if !pixels.iter().flatten().all(is_inside) {
             let (width, height) = (image.width, image.height);
-            return refused(&format!(
+            return self.refused(&format!(
                 "it exceeds the photograph, which is {width}x{height} as stored"
             ));
         }
-        let mut sum = DVec3::ZERO;
-        let mut count = 0.0;
-        for patch in &pixels {
+        let mean = |patch: &Vec<[u32; 2]>| {
             let colours = patch.iter().map(|&[x, y]| image.pixel(x, y));
             let usable = |colour: &[f32; 3]| colour.iter().all(|value| *value < CLIPPED);
-            let colours: Vec<[f32; 3]> = colours.filter(usable).collect();
+            let light = |colour: [f32; 3]| {
+                DVec3::from_array(colour.map(|value| f64::from(linear_from_srgb(value))))
+            };
+            let colours: Vec<DVec3> = colours.filter(usable).map(light).collect();
+            let count = colours.len() as f64;
             // The rest of a partly clipped patch would be biased to its dark pixels.
-            if 2 * colours.len() < patch.len() {
-                continue;
-            }
-            for colour in &colours {
-                sum += DVec3::from_array(colour.map(|value| f64::from(linear_from_srgb(value))));
-            }
-            count += colours.len() as f64;
-        }
+            (2 * colours.len() >= patch.len())
+                .then(|| (colours.into_iter().sum::<DVec3>() / count, count))
+        };
+        Ok(pixels.iter().map(mean).collect())
+    }
+
+    /// The mean linear light of the neutral patches.
+    fn neutral(&self, patches: &[Option<(DVec3, f64)>]) -> Result<DVec3> {
+        /// A lower mean is black: half an 8-bit code value.
+        const BLACK: f64 = 0.5 / 255.0 / 12.92;
+        let greys = match self {
+            Self::Chart(..) => &patches[FIRST_GREY..],
+            _ => patches,
+        };
+        let sums = greys.iter().flatten().map(|&(mean, count)| (mean * count, count));
+        let (sum, count) =
+            sums.fold((DVec3::ZERO, 0.0), |sum, next| (sum.0 + next.0, sum.1 + next.1));
         if count == 0.0 {
-            return refused("it is clipped; choose an area that is not white");
+            return self.refused("it is clipped; choose an area that is not white");
         }
         let mean = sum / count;
         if mean.min_element() < BLACK {
-            return refused("a channel of it is black; choose a brighter area");
+            return self.refused("a channel of it is black; choose a brighter area");
         }
         Ok(mean)
     }
 
-    /// The pixels of each neutral patch, column and row; they may be outside the photograph.
+    /// The matrix of the colours of a chart.
+    fn colours(&self, patches: &[Option<(DVec3, f64)>], gains: DVec3) -> Result<DMat3> {
+        let light: Vec<_> = patches.iter().map(|patch| patch.map(|(mean, _)| mean)).collect();
+        let greys = light[FIRST_GREY..].iter().flatten().map(|light| light.dot(LUMINANCE));
+        if !greys.is_sorted_by(|brighter, darker| brighter >= darker) {
+            return self.refused(
+                "its greys do not darken from white to black; give the corners at dark skin, bluish green, black and \
+                 white, in pixels as stored",
+            );
+        }
+        let matrix = colour_chart::matrix(&light, gains);
+        if matrix.is_none() {
+            tracing::warn!("white balance {self}: most patches are clipped: gains alone");
+        }
+        Ok(matrix.unwrap_or(DMat3::IDENTITY))
+    }
+
+    fn refused<T>(&self, problem: &str) -> Result<T> {
+        Err(Error::Usage(format!("white balance {self}: {problem}")))
+    }
+
+    /// The pixels of each patch, column and row; they may be outside the photograph.
     fn pixels(&self) -> Vec<Vec<[u32; 2]>> {
         match self {
             Self::Gains(_) | Self::Kelvin(_) => vec![],
@@ -127,38 +172,9 @@ impl WhiteBalance {
                 let column = |x: u32| (*y..y.saturating_add(*height)).map(move |y| [x, y]);
                 vec![(*x..x.saturating_add(*width)).flat_map(column).collect()]
             }
-            Self::Chart(_, corners) => (0..6).map(|patch| grey_patch(*corners, patch)).collect(),
+            Self::Chart(_, corners) => colour_chart::patches(*corners),
         }
     }
-}
-
-/// Samples of the middle of a patch in the chart's last row, column and row in pixels.
-fn grey_patch(corners: [[f64; 2]; 4], patch: u32) -> Vec<[u32; 2]> {
-    /// Samples in each direction.
-    const SAMPLES: u32 = 16;
-    let map = homography(corners);
-    let sample = |index: u32| {
-        let part = [index % SAMPLES, index / SAMPLES]
-            .map(|at| 0.3 + 0.4 * (f64::from(at) + 0.5) / f64::from(SAMPLES));
-        let position =
-            map * DVec3::new((f64::from(patch) + part[0]) / 6.0, (3.0 + part[1]) / 4.0, 1.0);
-        // A position left of or above the photograph is moved beyond its right or bottom edge.
-        let pixel = |value: f64| if value >= 0.0 { value as u32 } else { u32::MAX };
-        [pixel(position.x / position.z), pixel(position.y / position.z)]
-    };
-    (0..SAMPLES * SAMPLES).map(sample).collect()
-}
-
-/// The projective map of the unit square to these corners, in the order (0, 0), (1, 0), (1, 1), (0, 1) (Heckbert 1989,
-/// 2.2.3).
-fn homography(corners: [[f64; 2]; 4]) -> DMat3 {
-    let [a, b, c, d] = corners.map(DVec2::from_array);
-    let (right, down, excess) = (b - c, d - c, a - b + c - d);
-    let determinant = right.perp_dot(down);
-    let g = excess.perp_dot(down) / determinant;
-    let h = right.perp_dot(excess) / determinant;
-    let (across, along) = (b - a + g * b, d - a + h * d);
-    DMat3::from_cols(across.extend(g), along.extend(h), a.extend(1.0))
 }
 
 /// The linear sRGB of a black body (Kang et al. 2002), with luminance 1.
@@ -186,25 +202,49 @@ fn light(kelvin: f64) -> DVec3 {
 }
 
 /// The gains that make a colour grey and keep its luminance.
-fn neutralising(linear: DVec3) -> WhiteBalanceGains {
-    let luminance = linear.dot(DVec3::new(0.2126, 0.7152, 0.0722));
-    WhiteBalanceGains((luminance / linear).to_array().map(|gain| gain as f32))
+fn neutralising(linear: DVec3) -> DVec3 {
+    linear.dot(LUMINANCE) / linear
 }
 
-impl WhiteBalanceGains {
-    /// Applies the gains to a photograph.
+impl WhiteBalanceMatrix {
+    fn new(matrix: DMat3) -> Self {
+        let rows = matrix.transpose().as_mat3();
+        Self([rows.x_axis, rows.y_axis, rows.z_axis].map(|row| row.to_array()))
+    }
+
+    /// Applies the matrix to a photograph.
     pub(crate) fn apply(self, image: &mut Image) {
         /// Values per task of a thread.
         const VALUES: usize = 1 << 14;
-        let pixels = image.pixel_count().max(1);
-        for (plane, gain) in image.data.chunks_exact_mut(pixels).zip(self.0) {
-            if gain == 1.0 {
-                continue;
-            }
-            let balance =
-                |value: &mut f32| *value = srgb_from_linear(gain * linear_from_srgb(*value));
-            plane.par_chunks_mut(VALUES).for_each(|values| values.iter_mut().for_each(balance));
+        let pixels = image.pixel_count();
+        if pixels == 0 {
+            return;
         }
+        let Self([red, green, blue]) = self;
+        let gains = [red[0], green[1], blue[2]];
+        if self == Self::new(DMat3::from_diagonal(Vec3::from_array(gains).as_dvec3())) {
+            for (plane, gain) in image.data.chunks_exact_mut(pixels).zip(gains) {
+                if gain == 1.0 {
+                    continue;
+                }
+                let balance =
+                    |value: &mut f32| *value = srgb_from_linear(gain * linear_from_srgb(*value));
+                plane.par_chunks_mut(VALUES).for_each(|values| values.iter_mut().for_each(balance));
+            }
+            return;
+        }
+        let (reds, rest) = image.data.split_at_mut(pixels);
+        let (greens, blues) = rest.split_at_mut(pixels);
+        let map = Mat3::from_cols(red.into(), green.into(), blue.into()).transpose();
+        let chunks = |plane| <[f32]>::par_chunks_mut(plane, VALUES);
+        (chunks(reds), chunks(greens), chunks(blues)).into_par_iter().for_each(
+            |(reds, greens, blues)| {
+                for ((red, green), blue) in reds.iter_mut().zip(greens).zip(blues) {
+                    let light = Vec3::from_array([*red, *green, *blue].map(linear_from_srgb));
+                    [*red, *green, *blue] = (map * light).to_array().map(srgb_from_linear);
+                }
+            },
+        );
     }
 }
 
@@ -301,10 +341,10 @@ mod tests {
         (path, folder)
     }
 
-    fn gains(text: &str, image: &Image) -> Result<[f32; 3]> {
+    fn matrix(text: &str, image: &Image) -> Result<WhiteBalanceMatrix> {
         let (path, _folder) = saved(image);
         let balance: WhiteBalance = text.parse().unwrap();
-        Ok(balance.gains(Path::new("photos"), [("v1", path.as_path())], Levels::default())?.0)
+        balance.matrix(Path::new("photos"), [("v1", path.as_path())], Levels::default())
     }
 
     /// Ratio of the largest to the smallest channel of a pixel in linear light.
@@ -316,8 +356,7 @@ mod tests {
     #[test]
     fn a_grey_card_makes_every_grey_neutral_and_keeps_its_luminance() {
         let mut image = lit([0.06, 0.03, 0.015], |x, y| 0.1 + 0.8 * ((x + y) as f32 / 98.0));
-        let found = gains("v1,20,10,4,4", &image).unwrap();
-        WhiteBalanceGains(found).apply(&mut image);
+        matrix("v1,20,10,4,4", &image).unwrap().apply(&mut image);
         for (x, y) in [(0, 0), (30, 20), (59, 39)] {
             assert!(cast(&image, x, y) < 1.002, "{:?}", image.pixel(x, y));
         }
@@ -329,12 +368,12 @@ mod tests {
     }
 
     #[test]
-    fn a_chart_in_perspective_gives_its_greys() {
-        // Only the greys of the chart are neutral under the light.
+    fn a_chart_in_perspective_has_neutral_greys_and_colours_of_more_chroma() {
+        // All but the greys are of one pale colour, of which a matrix cannot know more than the greys.
         let corners = [[10.0, 5.0], [50.0, 8.0], [46.0, 32.0], [14.0, 35.0]];
         let map = homography(corners).inverse();
         let light = [0.3, 0.2, 0.1];
-        let image = Image::from_fn(60, 40, |x, y| {
+        let mut image = Image::from_fn(60, 40, |x, y| {
             let position = map * DVec3::new(f64::from(x) + 0.5, f64::from(y) + 0.5, 1.0);
             let [u, v] = [position.x / position.z, position.y / position.z];
             let is_grey = (0.75..1.0).contains(&v) && (0.0..1.0).contains(&u);
@@ -342,15 +381,40 @@ mod tests {
             light.map(|light: f32| srgb_from_linear(if is_grey { light * grey } else { 0.5 }))
         });
         let listed: Vec<String> = corners.as_flattened().iter().map(f64::to_string).collect();
-        let [red, green, blue] = gains(&format!("v1,{}", listed.join(",")), &image).unwrap();
-        assert!((red * 0.3 / (green * 0.2) - 1.0).abs() < 1e-2, "{red} {green} {blue}");
-        assert!((blue * 0.1 / (green * 0.2) - 1.0).abs() < 1e-2, "{red} {green} {blue}");
+        matrix(&format!("v1,{}", listed.join(",")), &image).unwrap().apply(&mut image);
+        assert!(cast(&image, 17, 31) < 1.02, "{:?}", image.pixel(17, 31));
+
+        let mirrored = [1, 0, 3, 2].map(|corner| corners[corner]);
+        let listed: Vec<String> = mirrored.as_flattened().iter().map(f64::to_string).collect();
+        let message = matrix(&format!("v1,{}", listed.join(",")), &image).unwrap_err().to_string();
+        assert!(
+            message.contains("greys do not darken") && message.lines().count() == 1,
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn a_matrix_mixes_channels_of_linear_light_below_black_too() {
+        let mut image = lit([0.06, 0.03, 0.015], |x, y| (x + y) as f32 / 98.0 - 0.1);
+        let before = image.clone();
+        let rows = [[1.5, -0.5, 0.0], [0.1, 0.8, 0.1], [-0.2, 0.0, 1.2]];
+        WhiteBalanceMatrix(rows).apply(&mut image);
+        for (x, y) in [(0, 0), (30, 20), (59, 39)] {
+            let [before, after] =
+                [&before, &image].map(|image| image.pixel(x, y).map(linear_from_srgb));
+            for (row, after) in rows.iter().zip(after) {
+                let mixed: f32 = row.iter().zip(before).map(|(weight, light)| weight * light).sum();
+                assert!((mixed - after).abs() < 1e-6, "{mixed} {after}");
+            }
+        }
     }
 
     #[test]
     fn gains_neutralise_the_light_of_a_temperature() {
         let of = |kelvin: f64| {
-            WhiteBalance::Kelvin(kelvin).gains(Path::new(""), [], Levels::default()).unwrap().0
+            let balance = WhiteBalance::Kelvin(kelvin);
+            let rows = balance.matrix(Path::new(""), [], Levels::default()).unwrap().0;
+            [rows[0][0], rows[1][1], rows[2][2]]
         };
         assert!(of(6504.0).iter().all(|gain| (gain - 1.0).abs() < 1e-3), "{:?}", of(6504.0));
         // Illuminant A, 2856 K: x = 0.44757, y = 0.40745, relative to D65.
@@ -374,9 +438,10 @@ mod tests {
     fn gains_of_one_keep_every_bit() {
         let image = lit([0.06, 0.03, 0.015], |x, _| x as f32 / 60.0);
         let mut balanced = image.clone();
-        WhiteBalanceGains([1.0; 3]).apply(&mut balanced);
+        WhiteBalanceMatrix::new(DMat3::IDENTITY).apply(&mut balanced);
         assert_eq!(balanced, image);
-        WhiteBalanceGains([1.0, 1.0, 2.0]).apply(&mut balanced);
+        WhiteBalanceMatrix::new(DMat3::from_diagonal(DVec3::new(1.0, 1.0, 2.0)))
+            .apply(&mut balanced);
         assert_eq!(balanced.data[..2 * 2400], image.data[..2 * 2400]);
     }
 
@@ -409,7 +474,7 @@ mod tests {
             ("v1,1,2,3,4", "is black"),
             ("v1,40,2,3,4", "is clipped"),
         ] {
-            let message = gains(text, &image).unwrap_err().to_string();
+            let message = matrix(text, &image).unwrap_err().to_string();
             assert!(message.contains(part) && message.lines().count() == 1, "{text}: {message}");
         }
     }

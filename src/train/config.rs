@@ -107,8 +107,8 @@ pub struct TrainConfig {
     mask_overlays: bool = true => Rule::Flag;
     /// White balance of the photographs before they are measured: gains R,G,B of linear light; the colour temperature
     /// of the light in kelvin; VIEW,x,y,w,h, a neutral area of one photograph in pixels as stored; or
-    /// VIEW,x1,y1,..,x4,y4, the corners of a chart of 24 patches: at the dark skin, bluish green, black and white
-    /// patch.
+    /// VIEW,x1,y1,..,x4,y4, the corners of a chart of 24 patches, at the dark skin, bluish green, black and white
+    /// patch, which also gives a matrix for the colours.
     white_balance: Option<WhiteBalance> = None, "none" => WHITE_BALANCE, "--white-balance WHITE";
     /// The fall-off of the lens: with u = 1 - cos of the angle off the axis, the light of the photographs is multiplied
     /// by exp(falloff u), and by the square of u as well; 0: left as it is.

@@ -33,7 +33,7 @@ use crate::photographs::image::{
 };
 use crate::photographs::targets::SceneTone;
 use crate::photographs::tone::{Exposure, MeasuredPhotograph, ToneSettings, is_black};
-use crate::photographs::white_balance::WhiteBalanceGains;
+use crate::photographs::white_balance::WhiteBalanceMatrix;
 use crate::{Error, Result};
 use geometry::SceneGeometry;
 pub(super) use geometry::exposures_at_points;
@@ -294,7 +294,7 @@ fn read(
     let colours = ColourCounts::of_levels(levels);
     let named = || all.iter().map(|file| (file.name.as_str(), file.input.as_path()));
     let balance = options.white_balance.as_ref().filter(|_| !files.is_empty());
-    let gains = balance.map(|balance| balance.gains(root, named(), levels)).transpose()?;
+    let balance = balance.map(|balance| balance.matrix(root, named(), levels)).transpose()?;
     let borders = match files.is_empty() {
         false => Borders::of_photographs(all, options),
         true => Borders::default(),
@@ -303,7 +303,7 @@ fn read(
     for files in files.chunks(Image::decoded_at_once(largest)) {
         let read = files.par_iter().map(|file| {
             let (invert_masks, name) = (options.invert_masks, file.name.clone());
-            Ok((name, PhotographStatistics::load(file, invert_masks, &borders, gains, &colours)?))
+            Ok((name, PhotographStatistics::load(file, invert_masks, &borders, balance, &colours)?))
         });
         photographs.extend(read.collect::<Result<Vec<_>>>()?);
     }
@@ -316,12 +316,12 @@ impl PhotographStatistics {
         file: &dataset::Photograph,
         invert_masks: bool,
         borders: &Borders,
-        gains: Option<WhiteBalanceGains>,
+        balance: Option<WhiteBalanceMatrix>,
         colours: &ColourCounts,
     ) -> Result<Self> {
         let (mut image, alpha) = PictureFile::open(&file.input)?.decode_counted(colours)?;
-        if let Some(gains) = gains {
-            gains.apply(&mut image);
+        if let Some(balance) = balance {
+            balance.apply(&mut image);
         }
         let decoded = (&image, alpha.as_ref());
         let mask = Mask::over(&file.input, decoded, file.mask.as_ref(), invert_masks)?;

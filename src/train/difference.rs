@@ -36,7 +36,8 @@ impl TrainConfig {
     /// change no step beyond rounding do not count: the number of steps, paths, scoring and saving, device and tiles.
     /// Nor does a lower limit of the Gaussians, so that a run that ran out of memory can resume.
     pub(crate) fn difference(&self, other: &Self) -> Option<String> {
-        const ALSO: [&str; 5] = ["steps", "reference", "stop.every", "stop.gain", "stop.margin"];
+        const ALSO: [&str; 6] =
+            ["steps", "reference", "stop.every", "stop.gain", "stop.detail_gain", "stop.margin"];
         let values = [self, other].map(values);
         let [values_here, others] = match &values {
             [Ok(values_here), Ok(others)] => [values_here, others],

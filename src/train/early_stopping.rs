@@ -149,17 +149,22 @@ impl Trainer {
         let _phase = tracing::info_span!("scoring").entered();
         let Some(psnr) = self.held_out_psnr()? else { return Ok(()) };
         let [_, whole] = self.config.schedule.resolution_steps;
-        let score = HeldOutScore { step: self.step, score: (1e3 * psnr).round() as i64 };
+        let Some(detail) = self.held_out_detail()? else { return Ok(()) };
+        let [score, detail] = [1e3 * psnr, 1e6 * detail].map(|score| score.round() as i64);
+        let score = HeldOutScore { step: self.step, score, detail };
+        tracing::debug!(
+            "step {}: held-out views {psnr:.3} dB, detail {:.5}",
+            self.step,
+            detail as f64 / 1e6
+        );
         let is_best = self.best_score().is_none_or(|best| score.score > best.score);
         if is_best && self.step >= whole {
             self.convergence.best = self.snapshot()?;
         }
         self.convergence.decisions.scores.push(score);
-        let scores: Vec<f64> = self
-            .held_out_scores()
-            .filter(|(step, _)| *step >= whole)
-            .map(|(_, psnr)| psnr)
-            .collect();
+        let scores = self.convergence.decisions.scores.iter().filter(|score| score.step >= whole);
+        let scores: Vec<[f64; 2]> =
+            scores.map(|score| [score.score as f64 / 1e3, score.detail as f64 / 1e6]).collect();
         if self.may_end_early() && self.config.stop.has_converged(&scores) {
             self.convergence.decisions.converged = Some(self.step);
             tracing::info!(
@@ -212,7 +217,7 @@ mod tests {
 
     #[test]
     fn a_run_ends_once_two_scores_in_a_row_gain_too_little() {
-        let stop = StopConfig { gain: 0.05, ..StopConfig::default() };
+        let stop = StopConfig { gain: 0.05, detail_gain: 0.1, ..StopConfig::default() };
         for (scores, ends) in [
             (&[][..], false),
             (&[20.0, 20.0], false),
@@ -222,7 +227,11 @@ mod tests {
             (&[20.0, 21.0, 20.0, 20.9], true),
             (&[20.0, 20.1, 20.2, 20.3, 20.4], false),
         ] {
-            assert_eq!(stop.has_converged(scores), ends, "{scores:?}");
+            let alone: Vec<_> = scores.iter().map(|score| [*score, 0.5]).collect();
+            assert_eq!(stop.has_converged(&alone), ends, "{scores:?}");
+            // As long as detail grows the run goes on.
+            let grows = scores.iter().zip(1..).map(|(score, step)| [*score, 0.2 * f64::from(step)]);
+            assert!(!stop.has_converged(&grows.collect::<Vec<_>>()), "{scores:?}");
         }
     }
 

@@ -10,7 +10,7 @@ use crate::camera::{Camera, TrainingFrame};
 use crate::loss::exposure::{Affine, Exposures};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::{Image, Mask};
-use crate::photographs::metrics::psnr_of_counted;
+use crate::photographs::metrics::{Scores, psnr_of_counted};
 use crate::photographs::targets::{SceneTone, Targets};
 use crate::photographs::tone::{LuminanceHistogram, is_black};
 
@@ -103,6 +103,21 @@ impl TargetViews {
         Ok((!self.0.is_empty()).then(|| sums.map(|sum| sum / self.0.len() as f64)))
     }
 
+    /// The mean SSIM of the colours of `render` for each camera, after the least-squares gain and bias of each channel;
+    /// `None` without views.
+    pub(super) fn mean_detail(
+        &self,
+        mut render: impl FnMut(&Camera) -> Result<Rendered>,
+    ) -> Result<Option<f64>> {
+        let mut sum = 0.0;
+        for TargetView { camera, target, mask, .. } in &self.0 {
+            let colors = render(camera)?.colors;
+            let aligned = clamped(&Affine::least_squares(&colors, target)?.applied(&colors));
+            sum += Scores::of_counted(&aligned, target, mask.as_ref())?.ssim;
+        }
+        Ok((!self.0.is_empty()).then(|| sum / self.0.len() as f64))
+    }
+
     pub(super) fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
@@ -154,6 +169,15 @@ impl Trainer {
         });
         self.convergence.held_out = views;
         scores
+    }
+
+    /// [`TargetViews::mean_detail`] of the held-out views.
+    pub(super) fn held_out_detail(&mut self) -> Result<Option<f64>> {
+        let (views, degree) =
+            (std::mem::take(&mut self.convergence.held_out), self.sh_degree(self.step));
+        let detail = views.mean_detail(|camera| self.render_of_degree(camera, degree));
+        self.convergence.held_out = views;
+        detail
     }
 
     /// Resets the denoiser to the identity if it hardly improves the held-out views (or, without any, some training

@@ -346,7 +346,7 @@ fn a_run_without_a_length_ends_when_held_out_views_have_converged() {
     let set = written(&Capture::default());
     let (root, out) = (set.path().display(), set.path().join("run"));
     // Any gain is too small.
-    let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 \
+    let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 --set stop.detail_gain=1 \
                    --set schedule.resolution_steps=[0,0] --set schedule.cooldown_steps=5 --set checkpoint_every=10";
     let train = format!("train {root} --out {} {options}", out.display());
     succeed(&train);
@@ -388,7 +388,7 @@ fn a_run_without_a_length_ends_when_held_out_views_have_converged() {
 fn a_run_that_ended_early_resumes_from_its_end() {
     let set = written(&Capture::default());
     let (root, out) = (set.path().display(), set.path().join("run"));
-    let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 \
+    let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 --set stop.detail_gain=1 \
                    --set schedule.resolution_steps=[0,0] --set schedule.cooldown_steps=6";
     let train = |more: &str| {
         succeed(&format!("train {root} --out {} {options} --progress json {more}", out.display()))

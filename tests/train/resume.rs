@@ -124,6 +124,7 @@ fn early(folder: &Path) -> (Dataset, TrainConfig) {
     config.steps = 60;
     config.schedule.resolution_steps = [0, 0];
     (config.stop.views, config.stop.every, config.stop.gain) = (1, 7, 90.0);
+    config.stop.detail_gain = 1.0;
     config.schedule.cooldown_steps = 9;
     (Dataset::load(folder, &config.load_options()).unwrap(), config)
 }

@@ -14,7 +14,7 @@ use crate::base::hash::Hasher;
 use crate::camera::Lens;
 use crate::photographs::image::{ColourCounts, Image, Levels, Orientation, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
-use crate::photographs::white_balance::WhiteBalanceGains;
+use crate::photographs::white_balance::WhiteBalanceMatrix;
 
 /// A photograph that was downscaled on loading, or is not kept.
 #[derive(Clone, Debug)]
@@ -31,7 +31,7 @@ pub struct Original {
     /// The size that a photograph of linear light is shrunk to before it is tone-mapped.
     pub(super) light_size: Option<(u32, u32)>,
     /// White balance of a photograph.
-    pub(super) gains: Option<WhiteBalanceGains>,
+    pub(super) balance: Option<WhiteBalanceMatrix>,
     /// As [`super::LoadOptions::falloff`], of a photograph.
     pub(super) falloff: Option<[f64; 2]>,
     /// The statistics of the photograph, and the size they were measured at.
@@ -51,7 +51,7 @@ impl Original {
             orientation: turns.loading,
             levels: Levels::default(),
             light_size: None,
-            gains: None,
+            balance: None,
             falloff: None,
             measured: None,
             checksum: None,
@@ -84,8 +84,8 @@ impl Original {
         let preparation = Preparation::new(lens, *undistort, size, &path.to_string_lossy())?;
         let colours = ColourCounts::of_levels(self.levels);
         let (mut image, _) = PictureFile::open(path)?.decode_counted(&colours)?;
-        if let Some(gains) = self.gains {
-            gains.apply(&mut image);
+        if let Some(balance) = self.balance {
+            balance.apply(&mut image);
         }
         let whole = preparation.photograph(image.turned(self.orientation), path, self.falloff)?;
         Ok(match self.light_size {

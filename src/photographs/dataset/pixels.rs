@@ -25,7 +25,7 @@ use crate::base::hash::Hasher;
 use crate::camera::{Camera, Lens};
 use crate::photographs::image::{ColourCounts, Image, Levels, Mask, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
-use crate::photographs::white_balance::WhiteBalanceGains;
+use crate::photographs::white_balance::WhiteBalanceMatrix;
 use crate::{Error, Result};
 
 /// The minimum side of a view, pixels.
@@ -54,7 +54,7 @@ pub(super) fn load(
     options: &LoadOptions,
     observer: Option<PhotographObserver<'_>>,
     levels: &mut Levels,
-    gains: Option<WhiteBalanceGains>,
+    balance: Option<WhiteBalanceMatrix>,
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
     let others = skipped.len();
@@ -65,7 +65,7 @@ pub(super) fn load(
             options,
             observer,
             *levels,
-            gains,
+            balance,
             skipped,
         )?;
         if let Some(views) = views {
@@ -74,7 +74,8 @@ pub(super) fn load(
         skipped.truncate(others);
         *levels = Levels::as_stored(options.light);
     }
-    let views = load_with((sources, headers), layout, options, observer, *levels, gains, skipped)?;
+    let views =
+        load_with((sources, headers), layout, options, observer, *levels, balance, skipped)?;
     Ok(views.unwrap_or_default())
 }
 
@@ -85,7 +86,7 @@ fn load_with(
     options: &LoadOptions,
     observer: Option<PhotographObserver<'_>>,
     levels: Levels,
-    gains: Option<WhiteBalanceGains>,
+    balance: Option<WhiteBalanceMatrix>,
     skipped: &mut Vec<String>,
 ) -> Result<Option<Vec<View>>> {
     let of_photographs: Vec<Option<ImageHeader>> =
@@ -116,7 +117,7 @@ fn load_with(
         options,
         at_once,
         observer,
-        gains,
+        balance,
         originals: &originals,
         borders: &borders,
         colours: &colours,
@@ -149,7 +150,7 @@ struct Loading<'a> {
     at_once: usize,
     observer: Option<PhotographObserver<'a>>,
     /// White balance of the photographs.
-    gains: Option<WhiteBalanceGains>,
+    balance: Option<WhiteBalanceMatrix>,
     /// For photographs at their own size.
     originals: &'a Allowance,
     /// Black borders of photographs by their size as stored.
@@ -329,8 +330,8 @@ impl ViewLoader<'_> {
         let mut problems = Vec::new();
         let [colours, reference_colours] = loading.colours;
         let mut photograph = self.decode(input, read, turns[0], colours, &mut problems)?;
-        if let (Some(gains), Some(photograph)) = (loading.gains, &mut photograph) {
-            gains.apply(&mut photograph.image);
+        if let (Some(balance), Some(photograph)) = (loading.balance, &mut photograph) {
+            balance.apply(&mut photograph.image);
         }
         let reference =
             self.decode(reference, read_reference, turns[1], reference_colours, &mut problems)?;
@@ -425,7 +426,7 @@ impl ViewLoader<'_> {
             return Ok((Some(whole), None));
         }
         let mut original = Original::new(path, *preparation.lens, options.undistort, turns);
-        (original.gains, original.falloff) = (loading.gains, options.falloff);
+        (original.balance, original.falloff) = (loading.balance, options.falloff);
         original.levels = loading.colours[0].levels();
         original.light_size = is_light.then_some(preparation.size);
         let measured = |image: &Image| match mask {

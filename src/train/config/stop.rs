@@ -15,9 +15,12 @@ pub struct StopConfig {
     /// Score them every N steps; with frozen geometry, every 50 at most. A score due within 50 steps after a round of
     /// density control is taken at the end of these.
     every: u64 = 250 => Rule::at_least(1), in "steps";
-    /// The run has converged once two scores in a row do not exceed the best before by this much; it then cools down
-    /// and ends.
+    /// The run has converged once two scores in a row do not exceed the best before by this much, nor their detail by
+    /// `stop.detail_gain`; it then cools down and ends.
     gain: f64 = 0.05 => Rule::POSITIVE_OR_0, in "dB";
+    /// Detail is the SSIM of the held-out views after the least-squares gain and bias of each channel: it grows when
+    /// PSNR, which follows the brightness of the views, has converged.
+    detail_gain: f64 = 0.001 => Rule::POSITIVE_OR_0, in "SSIM";
     /// A run whose last score is below its best by more than this restores the model of its best.
     margin: f64 = 0.25 => Rule::POSITIVE_OR_0, in "dB";
     /// Growth ends once four rounds of density control gain less than this for each doubling of the Gaussians; 0:
@@ -43,14 +46,19 @@ pub enum NotFinite {
 }
 
 impl StopConfig {
-    /// Whether a run with these scores, in order, has converged.
-    pub(crate) fn has_converged(&self, scores: &[f64]) -> bool {
+    /// Whether a run with these scores, PSNR and detail, in order, has converged.
+    pub(crate) fn has_converged(&self, scores: &[[f64; 2]]) -> bool {
         const PATIENCE: usize = 2;
         let Some(before) = scores.len().checked_sub(PATIENCE).filter(|&before| before > 0) else {
             return false;
         };
-        let best = |of: &[f64]| of.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        best(&scores[before..]) < best(&scores[..before]) + self.gain
+        let (before, since) = scores.split_at(before);
+        [self.gain, self.detail_gain].into_iter().enumerate().all(|(metric, gain)| {
+            let best = |scores: &[[f64; 2]]| {
+                scores.iter().map(|score| score[metric]).fold(f64::NEG_INFINITY, f64::max)
+            };
+            best(since) < best(before) + gain
+        })
     }
 
     /// The first setting that differs in `other` among those that a resumed run may change, with both values.
@@ -58,6 +66,7 @@ impl StopConfig {
         let settings = [
             ("every", self.every as f64, other.every as f64),
             ("gain", self.gain, other.gain),
+            ("detail_gain", self.detail_gain, other.detail_gain),
             ("margin", self.margin, other.margin),
         ];
         let changed = settings.into_iter().find(|(_, before, now)| before != now);

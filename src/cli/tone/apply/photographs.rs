@@ -13,7 +13,7 @@ use crate::photographs::image::files::{photographs_in, unread_in};
 use crate::photographs::image::{
     ColourCounts, Image, Levels, Mask, MaskFile, Orientation, PictureFile,
 };
-use crate::photographs::white_balance::WhiteBalanceGains;
+use crate::photographs::white_balance::WhiteBalanceMatrix;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
@@ -29,7 +29,7 @@ pub(super) struct InputPhotograph {
     pub(super) mask: Option<MaskFile>,
     /// The file to write.
     pub(super) target: Option<PathBuf>,
-    pub(super) gains: Option<WhiteBalanceGains>,
+    pub(super) balance: Option<WhiteBalanceMatrix>,
     /// The levels of the set.
     pub(super) levels: Levels,
     /// What the photographs of a dataset do not show at their borders.
@@ -44,8 +44,8 @@ impl InputPhotograph {
         colours: &ColourCounts,
     ) -> Result<(Image, Vec<usize>)> {
         let (mut image, alpha) = PictureFile::open(&self.input)?.decode_counted(colours)?;
-        if let Some(gains) = self.gains {
-            gains.apply(&mut image);
+        if let Some(balance) = self.balance {
+            balance.apply(&mut image);
         }
         let decoded = (&image, alpha.as_ref());
         let mask = Mask::over(&self.input, decoded, self.mask.as_ref(), inverted)?;
@@ -92,7 +92,7 @@ pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<Input
             mask,
             split: Some(split),
             target: None,
-            gains: None,
+            balance: None,
             levels: Levels::default(),
             borders: borders.clone(),
         };
@@ -113,9 +113,9 @@ pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<Input
     let levels = Levels::of_all(config.light, &training);
     levels.say();
     let balance = config.white_balance.as_ref();
-    let gains = balance.map(|balance| balance.gains(input, named(), levels)).transpose()?;
+    let balance = balance.map(|balance| balance.matrix(input, named(), levels)).transpose()?;
     for photograph in &mut photographs {
-        (photograph.gains, photograph.levels) = (gains, levels);
+        (photograph.balance, photograph.levels) = (balance, levels);
     }
     if let Some(out) = &args.out {
         set_targets(&mut photographs, out, args.format)?;
@@ -148,7 +148,7 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<InputPhotograph> {
         split: None,
         mask,
         target: None,
-        gains: None,
+        balance: None,
         levels: Levels::default(),
         borders,
     })
