@@ -22,7 +22,7 @@ const COLUMNS: usize = 6;
 const ROWS: usize = 4;
 const PATCHES: usize = COLUMNS * ROWS;
 
-/// Published sRGB colours of a chart of 24 patches (ColorChecker), by rows: its greys, from white on, are the last.
+/// Published sRGB colours of a chart of 24 patches (`ColorChecker`), by rows: its greys, from white on, are the last.
 const COLOURS: [[u8; 3]; PATCHES] = [
     [115, 82, 68],
     [194, 150, 130],
@@ -162,7 +162,7 @@ fn strength(patches: &[Patch]) -> f64 {
         .into_iter()
         .fold([f64::INFINITY; 2], |least, next| if next[0] < least[0] { next } else { least });
     let within = |(mean, _): &(&[f64; 2], f64)| mean[0] <= least + error;
-    means.iter().zip(RIDGES).filter(within).map(|(_, ridge)| ridge).last().unwrap_or(RIDGES[16])
+    means.iter().zip(RIDGES).rev().find(within).map_or(RIDGES[16], |(_, ridge)| ridge)
 }
 
 /// The grey-preserving matrix of least squares with a ridge: a row changes by multiples of red - green and of
