@@ -16,6 +16,7 @@
 
 #[cfg(feature = "io")]
 mod colour_chart;
+#[cfg(feature = "io")]
 pub mod dataset;
 #[cfg(feature = "io")]
 pub mod findings;
