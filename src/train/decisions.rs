@@ -26,7 +26,7 @@ pub(super) struct HeldOutScore {
     pub(super) step: u64,
     /// Their mean PSNR in thousandths of a dB.
     pub(super) score: i64,
-    /// Their mean detail, [`TargetViews::mean_detail`](super::target_views::TargetViews::mean_detail), in millionths.
+    /// Their mean detail, SSIM after the least-squares gain and bias of each channel, in millionths.
     pub(super) detail: i64,
 }
 

@@ -147,9 +147,8 @@ impl Trainer {
     /// Scores the held-out views, keeps the model if it is the best so far, and decides whether the run has converged.
     pub(super) fn score_held_out(&mut self) -> Result<()> {
         let _phase = tracing::info_span!("scoring").entered();
-        let Some(psnr) = self.held_out_psnr()? else { return Ok(()) };
+        let Some([psnr, detail]) = self.held_out_psnr_and_detail()? else { return Ok(()) };
         let [_, whole] = self.config.schedule.resolution_steps;
-        let Some(detail) = self.held_out_detail()? else { return Ok(()) };
         let [score, detail] = [1e3 * psnr, 1e6 * detail].map(|score| score.round() as i64);
         let score = HeldOutScore { step: self.step, score, detail };
         tracing::debug!(

@@ -85,37 +85,34 @@ impl TargetViews {
         affines: &[Affine],
         mut render: impl FnMut(&Camera) -> Result<Rendered>,
     ) -> Result<Option<[f64; 2]>> {
+        self.mean(|view| view.psnr(affines, &render(&view.camera)?))
+    }
+
+    /// The mean PSNR of the colours as [`Self::mean_psnr`], dB, and their mean detail.
+    pub(super) fn mean_psnr_and_detail(
+        &self,
+        affines: &[Affine],
+        mut render: impl FnMut(&Camera) -> Result<Rendered>,
+    ) -> Result<Option<[f64; 2]>> {
+        self.mean(|view| {
+            let rendered = render(&view.camera)?;
+            let [colors, _] = view.psnr(affines, &rendered)?;
+            Ok([colors, view.detail(&rendered)?])
+        })
+    }
+
+    /// The means of two scores over the views; `None` without views.
+    fn mean(
+        &self,
+        mut scores_of: impl FnMut(&TargetView) -> Result<[f64; 2]>,
+    ) -> Result<Option<[f64; 2]>> {
         let mut sums = [0.0; 2];
-        for TargetView { camera, target, mask, photograph } in &self.0 {
-            let exposure = photograph.and_then(|affine| affines.get(affine.0));
-            let neutral = exposure.map(|affine| affine.inverse().applied(target));
-            let target = neutral.as_ref().unwrap_or(target);
-            let rendered = render(camera)?;
-            for (sum, image) in sums.iter_mut().zip([&rendered.colors, rendered.output()]) {
-                let is_aligned = photograph.is_none() && !affines.is_empty();
-                let aligned =
-                    is_aligned.then(|| Affine::least_squares(image, target)).transpose()?;
-                let aligned = aligned.map(|affine| affine.applied(image));
-                let image = clamped(aligned.as_ref().unwrap_or(image));
-                *sum += psnr_of_counted(&image, target, mask.as_ref())?;
+        for view in &self.0 {
+            for (sum, score) in sums.iter_mut().zip(scores_of(view)?) {
+                *sum += score;
             }
         }
         Ok((!self.0.is_empty()).then(|| sums.map(|sum| sum / self.0.len() as f64)))
-    }
-
-    /// The mean SSIM of the colours of `render` for each camera, after the least-squares gain and bias of each channel;
-    /// `None` without views.
-    pub(super) fn mean_detail(
-        &self,
-        mut render: impl FnMut(&Camera) -> Result<Rendered>,
-    ) -> Result<Option<f64>> {
-        let mut sum = 0.0;
-        for TargetView { camera, target, mask, .. } in &self.0 {
-            let colors = render(camera)?.colors;
-            let aligned = clamped(&Affine::least_squares(&colors, target)?.applied(&colors));
-            sum += Scores::of_counted(&aligned, target, mask.as_ref())?.ssim;
-        }
-        Ok((!self.0.is_empty()).then(|| sum / self.0.len() as f64))
     }
 
     pub(super) fn is_empty(&self) -> bool {
@@ -124,6 +121,29 @@ impl TargetViews {
 }
 
 impl TargetView {
+    /// The PSNR, dB, of colours and output.
+    fn psnr(&self, affines: &[Affine], rendered: &Rendered) -> Result<[f64; 2]> {
+        let Self { target, mask, photograph, .. } = self;
+        let exposure = photograph.and_then(|affine| affines.get(affine.0));
+        let neutral = exposure.map(|affine| affine.inverse().applied(target));
+        let target = neutral.as_ref().unwrap_or(target);
+        let is_aligned = photograph.is_none() && !affines.is_empty();
+        let mut scores = [0.0; 2];
+        for (score, image) in scores.iter_mut().zip([&rendered.colors, rendered.output()]) {
+            let aligned = is_aligned.then(|| Affine::least_squares(image, target)).transpose()?;
+            let aligned = aligned.map(|affine| affine.applied(image));
+            let image = clamped(aligned.as_ref().unwrap_or(image));
+            *score = psnr_of_counted(&image, target, mask.as_ref())?;
+        }
+        Ok(scores)
+    }
+
+    /// The SSIM of the colours after the least-squares gain and bias of each channel.
+    fn detail(&self, Rendered { colors, .. }: &Rendered) -> Result<f64> {
+        let aligned = clamped(&Affine::least_squares(colors, &self.target)?.applied(colors));
+        Ok(Scores::of_counted(&aligned, &self.target, self.mask.as_ref())?.ssim)
+    }
+
     /// The view, resized to about this number of pixels if it has more.
     fn shrunk(self, pixels: usize) -> Self {
         let size = DVec2::new(self.camera.width.into(), self.camera.height.into());
@@ -171,13 +191,14 @@ impl Trainer {
         scores
     }
 
-    /// [`TargetViews::mean_detail`] of the held-out views.
-    pub(super) fn held_out_detail(&mut self) -> Result<Option<f64>> {
-        let (views, degree) =
-            (std::mem::take(&mut self.convergence.held_out), self.sh_degree(self.step));
-        let detail = views.mean_detail(|camera| self.render_of_degree(camera, degree));
+    /// [`TargetViews::mean_psnr_and_detail`] of the held-out views.
+    pub(super) fn held_out_psnr_and_detail(&mut self) -> Result<Option<[f64; 2]>> {
+        let (affines, degree) = (self.affines()?, self.sh_degree(self.step));
+        let views = std::mem::take(&mut self.convergence.held_out);
+        let render = |camera: &Camera| self.render_of_degree(camera, degree);
+        let scores = views.mean_psnr_and_detail(&affines, render);
         self.convergence.held_out = views;
-        detail
+        scores
     }
 
     /// Resets the denoiser to the identity if it hardly improves the held-out views (or, without any, some training
