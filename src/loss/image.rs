@@ -122,7 +122,7 @@ impl Loss {
         self.l1_partials.grow(&self.gpu, workgroups)?;
         self.ssim_partials.grow(&self.gpu, workgroups)?;
         match &mut self.kernels {
-            ImageKernels::Ssim(ssim) => ssim.reserve(&self.gpu, self.max_values),
+            ImageKernels::Ssim(ssim) => ssim.reserve(&self.gpu, size, self.max_values),
             ImageKernels::L1 { .. } => Ok(()),
         }
     }

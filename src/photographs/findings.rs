@@ -14,6 +14,10 @@ const MAX_BLACK: [f64; 2] = [5.0 / 255.0, 0.2];
 const MIN_RANGE: f64 = 0.05;
 /// The share of pixels that are black or near white beyond which there is nothing between.
 const MAX_EXTREME: f64 = 0.97;
+/// The saturation and the blue, as a part of green, below which the colours of dark photographs are likely those of the
+/// camera rather than of the scene: chair of LOM has 0.31 and 0.85, and its targets then err by 3.9 dB in colour.
+const MAX_PALE: f64 = 0.38;
+const MAX_BLUE: f64 = 0.9;
 /// Below this luminance a pixel is black.
 const BLACK: f64 = 2.0 / 255.0;
 
@@ -36,6 +40,7 @@ pub(crate) fn findings(
         narrow_range(&all).or_else(|| raised_black(&all)),
         extremes(&all),
         empty_channels(&lit),
+        exposure.and_then(|exposure| lost_blue(&lit, &all, exposure)),
         exposure.and_then(|exposure| lit_and_dark(exposure.lit, lit.len())),
         exposure.and_then(|_| gain_at_its_limit(&lit)),
         too_near_white(near_white),
@@ -108,10 +113,7 @@ fn extremes(all: &LuminanceHistogram) -> Option<String> {
 
 fn empty_channels(lit: &[&MeasuredPhotograph]) -> Option<String> {
     const NAMES: [&str; 3] = ["red", "green", "blue"];
-    let sum = |channel: usize| {
-        lit.iter().map(|one| f64::from(one.statistics.channel_means[channel])).sum::<f64>()
-    };
-    let means = [0, 1, 2].map(|channel| sum(channel) / lit.len() as f64);
+    let means = channel_means(lit);
     let largest = means.into_iter().fold(0.0, f64::max);
     let (empty, used): (Vec<_>, Vec<_>) =
         (0..3).partition(|&channel| means[channel] < EMPTY_CHANNEL * largest);
@@ -126,6 +128,32 @@ fn empty_channels(lit: &[&MeasuredPhotograph]) -> Option<String> {
             empty.iter().map(|&channel| means[channel]).fold(0.0, f64::max),
             named(&used),
             named(&used)
+        )
+    })
+}
+
+fn channel_means(lit: &[&MeasuredPhotograph]) -> [f64; 3] {
+    let mean = |channel: usize| {
+        let means = lit.iter().map(|one| f64::from(one.statistics.channel_means[channel]));
+        means.sum::<f64>() / lit.len() as f64
+    };
+    [0, 1, 2].map(mean)
+}
+
+/// The curve scales all channels alike, and cameras lose blue first.
+fn lost_blue(
+    lit: &[&MeasuredPhotograph],
+    all: &LuminanceHistogram,
+    exposure: &Exposure,
+) -> Option<String> {
+    let (saturation, [_, green, blue]) = (all.saturation(), channel_means(lit));
+    let is_pale = (EMPTY_CHANNEL..MAX_PALE).contains(&saturation) && blue < MAX_BLUE * green;
+    (is_pale && exposure.lit == 0 && blue > EMPTY_CHANNEL * green).then(|| {
+        format!(
+            "colours are pale and lack blue (saturation {saturation:.2}, blue {:.2} of green), which the automatic \
+             curve keeps: a photograph in normal light (`tone fit --profile`) or a colour chart (`--white-balance`) \
+             shows the true ones",
+            blue / green
         )
     })
 }
@@ -211,6 +239,28 @@ mod tests {
         let text = found(&[coloured(&values, [0.01, 1.0, 0.0])]);
         assert!(text.starts_with("the photographs are empty in red and blue"), "{text}");
         assert_eq!(found(&[coloured(&values, [0.3, 1.0, 0.1])]), "");
+    }
+
+    #[test]
+    fn pale_colours_without_blue_are_found_in_dark_photographs() {
+        let of = |colour, brightest: f32| {
+            let values: Vec<(f32, usize)> =
+                (0..1000).map(|index| (index as f32 * brightest / 1e3, 1)).collect();
+            found(&[coloured(&values, colour)])
+        };
+        let text = of([1.0, 0.95, 0.75], 0.2);
+        assert!(
+            text.starts_with("colours are pale and lack blue (saturation 0.25, blue 0.79"),
+            "{text}"
+        );
+        for (colour, brightest) in [
+            ([1.0, 0.95, 0.9], 0.2),
+            ([1.0, 0.95, 0.75], 1.0),
+            ([1.0, 0.8, 0.4], 0.2),
+            ([1.0, 1.0, 1.0], 0.2),
+        ] {
+            assert_eq!(of(colour, brightest), "", "{colour:?} up to {brightest}");
+        }
     }
 
     #[test]

@@ -24,8 +24,7 @@ pub(super) struct SsimLoss {
 #[derive(Debug)]
 #[expect(clippy::large_enum_variant, reason = "a training has one")]
 enum SsimKernels {
-    /// The first layout that fits a view is used; the last one fits every view.
-    One(Vec<(SsimLayout, Pipeline<ssim::Kernel>)>),
+    One(StripKernels),
     Two {
         forward: Pipeline<ssim_forward::Kernel>,
         backward: Pipeline<ssim_backward::Kernel>,
@@ -34,6 +33,16 @@ enum SsimKernels {
         /// Workgroups of `backward` that are done; 0 between steps.
         arrivals: Buffer<u32>,
     },
+}
+
+/// The one kernel in each of `LAYOUTS`, compiled for the first view that needs it: a software device takes longer for that
+/// than for a step.
+#[derive(Debug)]
+struct StripKernels {
+    gpu: Gpu,
+    /// Whether the gradient is added to that of earlier terms.
+    adds: bool,
+    compiled: [Option<Pipeline<ssim::Kernel>>; LAYOUTS.len()],
 }
 
 /// The layout of the one kernel: columns per lane, rows per subgroup, and the alignment of its loads and stores in
@@ -45,6 +54,7 @@ struct SsimLayout {
     alignment: u32,
 }
 
+/// The first layout that fits a view is used; the last one fits every view.
 const LAYOUTS: [SsimLayout; 2] = [
     SsimLayout { columns: 12, rows: 192, alignment: 4 },
     SsimLayout { columns: 10, rows: 192, alignment: 1 },
@@ -75,23 +85,31 @@ fn rows(size: UVec2, lanes: u32) -> u32 {
     (columns * u64::from(size.y) / SUBGROUPS).clamp(ROWS[0], ROWS[1]) as u32
 }
 
-fn layout_of(
-    kernels: &[(SsimLayout, Pipeline<ssim::Kernel>)],
-    size: UVec2,
-) -> &(SsimLayout, Pipeline<ssim::Kernel>) {
-    let first = kernels.iter().position(|(layout, _)| layout.fits(size));
-    &kernels[first.unwrap_or(kernels.len() - 1)]
+fn layout_of(size: UVec2) -> usize {
+    LAYOUTS.iter().position(|layout| layout.fits(size)).unwrap_or(LAYOUTS.len() - 1)
+}
+
+impl StripKernels {
+    fn kernel(&mut self, size: UVec2) -> Result<&Pipeline<ssim::Kernel>> {
+        let index = layout_of(size);
+        let compiled = match self.compiled[index].take() {
+            Some(kernel) => kernel,
+            None => {
+                let SsimLayout { columns, rows, alignment } = LAYOUTS[index];
+                self.gpu.pipeline(&ssim::Constants { columns, rows, alignment, adds: self.adds })?
+            }
+        };
+        Ok(self.compiled[index].insert(compiled))
+    }
 }
 
 impl SsimLoss {
     /// Builds the kernels; `adds`: the gradient is added to that of earlier terms.
     pub(super) fn new(gpu: &Gpu, weight: f64, adds: bool) -> Result<Self> {
-        let kernel = |layout| {
-            let SsimLayout { columns, rows, alignment } = layout;
-            Ok((layout, gpu.pipeline(&ssim::Constants { columns, rows, alignment, adds })?))
-        };
         let kernels = match gpu.properties().is_cpu {
-            true => SsimKernels::One(LAYOUTS.into_iter().map(kernel).collect::<Result<_>>()?),
+            true => {
+                SsimKernels::One(StripKernels { gpu: gpu.clone(), adds, compiled: [None, None] })
+            }
             false => SsimKernels::Two {
                 forward: gpu.pipeline(&ssim_forward::Constants::default())?,
                 backward: gpu.pipeline(&ssim_backward::Constants { adds })?,
@@ -106,16 +124,21 @@ impl SsimLoss {
         Ok(Self { weight, lanes: gpu.properties().subgroup_size, kernels })
     }
 
-    /// Allocates scratch memory for views of up to `values` values; it never shrinks.
-    pub(super) fn reserve(&mut self, gpu: &Gpu, values: u32) -> Result<()> {
-        let SsimKernels::Two { derivatives, .. } = &mut self.kernels else { return Ok(()) };
-        derivatives.iter_mut().try_for_each(|buffer| buffer.grow(gpu, values as usize))
+    /// Allocates scratch memory for views of up to `values` values, which never shrinks, and compiles what a view of
+    /// `size` needs.
+    pub(super) fn reserve(&mut self, gpu: &Gpu, size: UVec2, values: u32) -> Result<()> {
+        match &mut self.kernels {
+            SsimKernels::One(kernels) => kernels.kernel(size).map(drop),
+            SsimKernels::Two { derivatives, .. } => {
+                derivatives.iter_mut().try_for_each(|buffer| buffer.grow(gpu, values as usize))
+            }
+        }
     }
 
     /// Subgroups, one per workgroup, and so the partial sums of a view.
     pub(super) fn workgroups(&self, size: UVec2) -> u32 {
         3 * match &self.kernels {
-            SsimKernels::One(kernels) => layout_of(kernels, size).0.subgroups(size, self.lanes),
+            SsimKernels::One(_) => LAYOUTS[layout_of(size)].subgroups(size, self.lanes),
             SsimKernels::Two { .. } => {
                 size.x.div_ceil(self.lanes) * size.y.div_ceil(rows(size, self.lanes))
             }
@@ -142,7 +165,7 @@ impl SsimLoss {
         let (forward, backward, [d_mean, d_square, d_product], arrivals) = match &mut self.kernels {
             SsimKernels::One(kernels) => {
                 pass.dispatch(
-                    &layout_of(kernels, size).1,
+                    kernels.kernel(size)?,
                     &ssim::Params { width, height, loss_begin, loss_end, l1_scale, ssim_scale },
                     ssim::Buffers {
                         render: render.slice(),

@@ -72,7 +72,7 @@ impl LuminanceHistogram {
 
     /// Mean difference between the largest and smallest channel over the mean of the largest: 0 for greys, 1 for pure
     /// colours.
-    pub(super) fn saturation(&self) -> f64 {
+    pub(in crate::photographs) fn saturation(&self) -> f64 {
         self.chroma / self.value.max(f64::MIN_POSITIVE)
     }
 
