@@ -261,6 +261,7 @@ pub enum Stop {
 
 impl Stop {
     /// Every reason.
+    #[cfg(feature = "io")]
     pub(crate) const ALL: [Self; 4] =
         [Self::Interrupted, Self::Terminated, Self::HungUp, Self::TimeUp];
 

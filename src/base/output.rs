@@ -1,7 +1,9 @@
 //! Files that appear when complete, and text that is safe to print.
 
 use std::borrow::Cow;
-use std::path::{Path, PathBuf};
+use std::path::Path;
+#[cfg(feature = "io")]
+use std::path::PathBuf;
 
 use crate::{Error, Result};
 
@@ -37,8 +39,9 @@ pub fn write_whole_with(
     })
 }
 
-/// The path of a file of ours, such as one of a run, which [`write_whole`] may write: a link that somebody left there is
-/// removed, and so is a pipe. They decide only of paths that the user names.
+/// The path of a file of ours, such as one of a run, for [`write_whole`]: a link that somebody left there is removed,
+/// and so is a pipe. Links are followed in paths that the user names.
+#[cfg(feature = "io")]
 pub fn own_file(path: PathBuf) -> Result<PathBuf> {
     let is_usual = path.symlink_metadata().map_or(true, |there| there.is_file() || there.is_dir());
     if !is_usual {
@@ -56,6 +59,7 @@ fn remove_link_or_file(path: &Path) -> std::io::Result<()> {
 }
 
 /// Flushes those of the files that exist, and then their folder, to the disk.
+#[cfg(feature = "io")]
 pub fn flush_to_disk(folder: &Path, files: &[&str]) -> Result<()> {
     for path in files.iter().map(|file| folder.join(file)).filter(|path| path.is_file()) {
         // Windows flushes only what may be written.

@@ -110,7 +110,7 @@ impl Reporter {
     fn draw(&mut self, event: Event<'_>) {
         match event {
             Event::Started { step, memory, .. } => {
-                tell_on_stderr(&foreseen(memory));
+                tell_on_stderr(foreseen(memory));
                 self.bar = ProgressBar::new(self.steps).with_position(step);
                 self.bar.set_style(style(self.may_end_early));
             }
@@ -125,7 +125,7 @@ impl Reporter {
             }
             Event::Evaluated { step, evaluation } => {
                 if let Some(line) = summary(evaluation).filter(|_| step < self.steps) {
-                    self.bar.suspend(|| tell_on_stderr(&format!("step {step}: {line}")));
+                    self.bar.suspend(|| tell_on_stderr(format!("step {step}: {line}")));
                 }
             }
             Event::Finished(_) => self.bar.finish_and_clear(),
@@ -135,16 +135,16 @@ impl Reporter {
 
     fn write(&mut self, event: Event<'_>) {
         match event {
-            Event::Started { memory, .. } => tell_on_stderr(&foreseen(memory)),
-            Event::Step(report) if self.is_due() => tell_on_stderr(&self.line(report)),
+            Event::Started { memory, .. } => tell_on_stderr(foreseen(memory)),
+            Event::Step(report) if self.is_due() => tell_on_stderr(self.line(report)),
             Event::HeldOut { step, psnr } => {
-                tell_on_stderr(&format!(
+                tell_on_stderr(format!(
                     "step {step}: held-out views {psnr:.2} dB against their targets"
                 ));
             }
             Event::Evaluated { step, evaluation } => {
                 if let Some(line) = summary(evaluation).filter(|_| step < self.steps) {
-                    tell_on_stderr(&format!("step {step}: {line}"));
+                    tell_on_stderr(format!("step {step}: {line}"));
                 }
             }
             _ => {}

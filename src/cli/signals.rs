@@ -1,5 +1,5 @@
-//! Signals to a run: SIGINT, SIGTERM and SIGHUP save and stop, one that comes a second later or more ends the process at
-//! once, SIGUSR1 saves and continues.
+//! Signals to a run: SIGINT, SIGTERM and SIGHUP save and stop, another a second later or more ends the process at once,
+//! SIGUSR1 saves and continues.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};

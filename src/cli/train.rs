@@ -27,8 +27,8 @@ use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 /// is chosen from that; options override it. With --config, or a preset that states every setting (paper and the
 /// benchmarks), nothing is chosen.
 ///
-/// SIGINT, SIGTERM and SIGHUP save a checkpoint and stop, with exit code 130, 143 or 129; another a second later or more
-/// ends the process at once. Under nohup, SIGHUP does nothing. SIGUSR1 saves a checkpoint and continues. --resume
+/// SIGINT, SIGTERM and SIGHUP save a checkpoint and stop, with exit code 130, 143 or 129; another a second later or
+/// more ends the process at once. Under nohup, SIGHUP does nothing. SIGUSR1 saves a checkpoint and continues. --resume
 /// continues a run to the same bits; on a finished run it does nothing.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLE)]

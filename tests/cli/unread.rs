@@ -1,4 +1,4 @@
-//! Commands of whose output nobody reads a line: they do their work all the same.
+//! Commands whose output has no reader: they do their work all the same.
 #![cfg(unix)]
 
 use std::collections::BTreeMap;
