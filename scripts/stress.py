@@ -1,17 +1,18 @@
 #!/usr/bin/env python3
 """Campaigns that take too long for tests. Each prints its result; the first that fails ends the script.
 
-    scripts/stress.py [table] [night] [conditioning] [cameras] [long] [kills] [fuzz] [guards] [growth]
+    scripts/stress.py [table] [night] [conditioning] [cameras] [long] [kills] [terminals] [fuzz] [guards] [growth]
 
 Without a name, all of them run.
 
 NIGHTSPLAT           the command (default: target/release/nightsplat, built first)
-STEPS, KILLS         of long and kills (100000, 200)
+STEPS, KILLS         of long and kills (100000, 200); a tenth of KILLS is the number of terminals
 FUZZ_SECONDS         for each fuzz target (600)
 NIGHTSPLAT_SCENES    the scenes of growth, comma-separated; NIGHTSPLAT_DOWNSCALES (4,2,1), NIGHTSPLAT_SEEDS (1,2,3)
 """
 
 import os
+import pty
 import random
 import signal
 import subprocess
@@ -132,6 +133,57 @@ def kills(folder):
     print(f"{killed} kills over {runs} runs: every one ended with the bytes of an uninterrupted run")
 
 
+def terminals(folder):
+    """Closes the terminals of runs at random moments, and what they print to; nothing is lost."""
+    data = synth(folder / "set", 32, 8)
+    rounds = random.Random(15)
+
+    def arguments(out, steps=2000):
+        return [str(a) for a in (command(), "train", data, "--out", out, "--steps", steps, "--max-gaussians", 500,
+                                 "--checkpoint-every", 0, "--checkpoint-minutes", 0, "--resume", "-v", *PLAIN)]
+
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    subprocess.run(arguments(folder / "straight"), check=True, **quiet)
+    expected = (folder / "straight" / "model.ply").read_bytes()
+    closed = runs = 0
+    while closed < max(1, KILLS // 10):
+        runs += 1
+        out = folder / f"closed-{runs}"
+        while True:
+            # A terminal of its own, as of a connection, or one that the run was started to outlive, as by nohup.
+            outlives = rounds.random() < 0.5
+            master, terminal = pty.openpty()
+            disposition = signal.SIG_IGN if outlives else signal.SIG_DFL
+            child = subprocess.Popen(arguments(out), stdout=terminal, stderr=terminal, start_new_session=True,
+                                     preexec_fn=lambda: signal.signal(signal.SIGHUP, disposition))
+            os.close(terminal)
+            started = wait_for(child, out / "train.csv")
+            time.sleep(rounds.uniform(0.05, 2))
+            os.close(master)
+            if started:
+                child.send_signal(signal.SIGHUP)
+            code = child.wait()
+            closed += 1
+            if code == 0:
+                break
+            steps = (out / "train.csv").read_text().count("\n") - 1
+            if outlives or code != 129 or not (out / "checkpoint.safetensors").exists():
+                sys.exit(f"a run whose terminal closed ended with {code} after {steps} steps")
+        if (out / "model.ply").read_bytes() != expected:
+            sys.exit(f"after {closed} closed terminals a run ended with other bytes")
+    print(f"{closed} closed terminals over {runs} runs: every one ended with the bytes of an uninterrupted run")
+
+
+def wait_for(child, file):
+    """Whether the process has written a line of steps since it started."""
+    before = file.stat().st_mtime_ns if file.exists() else 0
+    while child.poll() is None:
+        if file.exists() and file.stat().st_mtime_ns > before and file.read_text().count("\n") > 1:
+            return True
+        time.sleep(0.02)
+    return False
+
+
 def fuzz(_):
     """Every parser, FUZZ_SECONDS each."""
     run(ROOT / "scripts" / "fuzz.sh", FUZZ_SECONDS)
@@ -150,7 +202,7 @@ def growth(_):
     run("cargo", "test", "--release", "--lib", "--", "--ignored", "--nocapture", "no_round_of_a_real_scene")
 
 
-ALL = (table, night, conditioning, cameras, long, kills, fuzz, guards, growth)
+ALL = (table, night, conditioning, cameras, long, kills, terminals, fuzz, guards, growth)
 CAMPAIGNS = {campaign.__name__: campaign for campaign in ALL}
 
 

@@ -1,7 +1,6 @@
 //! The command line: one file per subcommand.
 
 use std::ffi::OsString;
-use std::io::Write;
 use std::path::Path;
 
 use anyhow::Result;
@@ -39,6 +38,7 @@ mod signals;
 pub mod sweep;
 pub mod synth;
 mod table;
+mod tell;
 pub mod tone;
 pub mod train;
 pub mod vary;
@@ -47,6 +47,8 @@ mod words;
 
 pub use hints::hint;
 pub use phases::Phases;
+pub use tell::tell_on_stderr;
+use tell::{print, tell};
 
 /// 3D Gaussian Splatting from dark photographs, on any Vulkan device.
 #[derive(Debug, Parser)]
@@ -85,7 +87,7 @@ For developers:
 
 Exit codes:
   0 done; 1 failed; 2 misuse; 3 data that cannot be used; 4 no device, or not enough memory;
-  75 saved, run it again (train --max-minutes); 130 and 143 saved (SIGINT and SIGTERM)";
+  75 saved, run it again (train --max-minutes); 129, 130 and 143 saved (SIGHUP, SIGINT, SIGTERM)";
 
 #[derive(Debug, Subcommand)]
 enum Command {
@@ -166,10 +168,10 @@ pub fn message(error: &anyhow::Error) -> String {
     }
 }
 
-/// Prints the end of a command: the files that it wrote, if any, and the command to run next.
-fn finish(wrote: &str, next: &str) -> Result<()> {
+/// Tells the end of a command: the files that it wrote, if any, and the command to run next.
+fn finish(wrote: &str, next: &str) {
     let wrote = if wrote.is_empty() { String::new() } else { format!("wrote {wrote}\n") };
-    Ok(writeln!(std::io::stdout(), "{}next: {}", printable(&wrote), printable(next))?)
+    tell(format_args!("{}next: {}", printable(&wrote), printable(next)));
 }
 
 /// A path as a word of a command.

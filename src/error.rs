@@ -253,16 +253,24 @@ pub enum Stop {
     Interrupted,
     /// SIGTERM, from the system or a scheduler; the exit code is 143.
     Terminated,
+    /// SIGHUP, from a terminal or connection that has gone; the exit code is 129.
+    HungUp,
     /// `max_minutes` are over; the exit code is 75, on which schedulers repeat a job.
     TimeUp,
 }
 
 impl Stop {
+    /// Every reason.
+    #[cfg(feature = "io")]
+    pub(crate) const ALL: [Self; 4] =
+        [Self::Interrupted, Self::Terminated, Self::HungUp, Self::TimeUp];
+
     /// Its exit code.
     pub fn exit_code(self) -> u8 {
         match self {
             Self::Interrupted => 130,
             Self::Terminated => 143,
+            Self::HungUp => 129,
             Self::TimeUp => 75,
         }
     }
@@ -273,6 +281,7 @@ impl std::fmt::Display for Stop {
         formatter.write_str(match self {
             Self::Interrupted => "interrupted",
             Self::Terminated => "terminated",
+            Self::HungUp => "hung up",
             Self::TimeUp => "its time was up",
         })
     }

@@ -1,10 +1,10 @@
 //! The `nightsplat` command: parses, runs, prints an error once and sets the exit code.
 
-use std::io::{IsTerminal, Write};
+use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use nightsplat::Error;
-use nightsplat::cli::{Cli, Phases, hint, in_one_line, message};
+use nightsplat::cli::{Cli, Phases, hint, in_one_line, message, tell_on_stderr};
 use tracing_subscriber::filter::{LevelFilter, filter_fn};
 use tracing_subscriber::prelude::*;
 
@@ -22,6 +22,8 @@ fn main() -> ExitCode {
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
+        // They would be told on standard error, which is what has failed.
+        .log_internal_errors(false)
         .without_time();
     let is_line = filter_fn(move |metadata| metadata.is_event() && *metadata.level() <= level);
     let phases = (cli.verbosity() > 0).then(|| Phases::begin().with_filter(Phases::filter()));
@@ -30,12 +32,7 @@ fn main() -> ExitCode {
         .with(phases)
         .init();
     let Err(error) = cli.run() else { return ExitCode::SUCCESS };
-    if is_broken_pipe(&error) {
-        return ExitCode::SUCCESS;
-    }
-    // Standard error may be closed.
-    let message = message(&error);
-    let _ = writeln!(std::io::stderr(), "error: {}", in_one_line(&message));
+    tell_on_stderr(format_args!("error: {}", in_one_line(&message(&error))));
     ExitCode::from(error.downcast_ref::<Error>().map_or(1, Error::exit_code))
 }
 
@@ -56,13 +53,6 @@ fn misuse(error: &clap::Error) -> ExitCode {
         lines.take_while(|line| !line.starts_with("Usage:") && !line.starts_with("For more"));
     let line = told.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
     let line = hint(error).map_or(line, |line| format!("error: {line}"));
-    // Standard error may be closed.
-    let _ = writeln!(std::io::stderr(), "{}; see --help", in_one_line(&line));
+    tell_on_stderr(format_args!("{}; see --help", in_one_line(&line)));
     ExitCode::from(2)
-}
-
-/// Whether the reader closed the pipe, as in `nightsplat doctor | head`.
-fn is_broken_pipe(error: &anyhow::Error) -> bool {
-    let is_broken = |io: &std::io::Error| io.kind() == std::io::ErrorKind::BrokenPipe;
-    error.chain().any(|cause| cause.downcast_ref().is_some_and(is_broken))
 }

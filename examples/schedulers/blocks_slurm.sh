@@ -21,7 +21,7 @@ run() {
             # Saved, or killed for example for lack of memory: again, within the job. A requeue waits for two minutes.
             75 | 137) ;;
             # The signal two minutes before the end of the job's time.
-            143 | 130) exec scontrol requeue "$SLURM_JOB_ID" ;;
+            143 | 130 | 129) exec scontrol requeue "$SLURM_JOB_ID" ;;
             *) break ;;
         esac
     done

@@ -19,6 +19,6 @@ point=$(sed -n "${SLURM_ARRAY_TASK_ID:?run by sbatch --array}p" "${1:?name the f
 srun sh -c "exec $point"
 code=$?
 case $code in
-    75 | 143 | 130) scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}" ;;
+    75 | 143 | 130 | 129) scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}" ;;
     *) exit $code ;;
 esac

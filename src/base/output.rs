@@ -2,6 +2,8 @@
 
 use std::borrow::Cow;
 use std::path::Path;
+#[cfg(feature = "io")]
+use std::path::PathBuf;
 
 use crate::{Error, Result};
 
@@ -11,7 +13,7 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
 }
 
 /// [`write_whole`] with a function that writes the file under the given name. The target of a link is replaced, and the
-/// link kept; a device or a pipe is written to, not replaced.
+/// link kept; a device or a pipe is written to, not replaced. What has the temporary name is removed, not followed.
 pub fn write_whole_with(
     path: &Path,
     write: impl FnOnce(&Path) -> std::io::Result<()>,
@@ -26,12 +28,49 @@ pub fn write_whole_with(
     let mut partial = target.as_os_str().to_owned();
     partial.push(".partial");
     let partial = Path::new(&partial);
-    let written = write(partial).and_then(|()| std::fs::rename(partial, &target));
+    let written = remove_link_or_file(partial)
+        .and_then(|()| std::fs::File::create_new(partial).map(drop))
+        .and_then(|()| write(partial))
+        .and_then(|()| std::fs::rename(partial, &target));
     written.map_err(|error| {
         // The first failure is the one to report; a remaining temporary file is not.
         let _ = std::fs::remove_file(partial);
         failed(error)
     })
+}
+
+/// The path of a file of ours, such as one of a run, for [`write_whole`]: a link that somebody left there is removed,
+/// and so is a pipe. Links are followed in paths that the user names.
+#[cfg(feature = "io")]
+pub fn own_file(path: PathBuf) -> Result<PathBuf> {
+    let is_usual = path.symlink_metadata().map_or(true, |there| there.is_file() || there.is_dir());
+    if !is_usual {
+        remove_link_or_file(&path)
+            .map_err(|error| Error::output(&path, format!("is in the way ({error}); remove it")))?;
+    }
+    Ok(path)
+}
+
+fn remove_link_or_file(path: &Path) -> std::io::Result<()> {
+    match std::fs::remove_file(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error),
+        _ => Ok(()),
+    }
+}
+
+/// Flushes those of the files that exist, and then their folder, to the disk.
+#[cfg(feature = "io")]
+pub fn flush_to_disk(folder: &Path, files: &[&str]) -> Result<()> {
+    for path in files.iter().map(|file| folder.join(file)).filter(|path| path.is_file()) {
+        // Windows flushes only what may be written.
+        let file = std::fs::File::options().read(true).write(cfg!(windows)).open(&path);
+        file.and_then(|file| file.sync_all()).map_err(|error| {
+            Error::output(&path, format!("cannot be flushed ({error}); check the disk"))
+        })?;
+    }
+    // Not every system can flush a folder.
+    let _ = std::fs::File::open(folder).and_then(|folder| folder.sync_all());
+    Ok(())
 }
 
 /// Creates a folder unless it exists.
@@ -101,6 +140,28 @@ mod tests {
         assert!(!pipe.metadata().unwrap().is_file(), "the pipe was replaced");
         assert_eq!(reader.join().unwrap(), b"whole");
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 3);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_planted_link_decides_nothing_about_a_partial_file_or_a_file_of_ours() {
+        let folder = tempfile::tempdir().unwrap();
+        let [file, out, partial] =
+            ["file", "out", "out.partial"].map(|name| folder.path().join(name));
+        std::fs::write(&file, "precious").unwrap();
+        std::os::unix::fs::symlink(&file, &partial).unwrap();
+        write_whole(&out, b"new").unwrap();
+        assert!(!out.is_symlink() && std::fs::read(&out).unwrap() == b"new");
+        std::fs::remove_file(&out).unwrap();
+        std::os::unix::fs::symlink(&file, &out).unwrap();
+        write_whole(&own_file(out.clone()).unwrap(), b"newer").unwrap();
+        assert!(!out.is_symlink() && std::fs::read(&out).unwrap() == b"newer");
+        assert_eq!(std::fs::read(&file).unwrap(), b"precious");
+        // What a killed process left is no obstacle.
+        std::fs::write(&partial, "half").unwrap();
+        write_whole(&out, b"newest").unwrap();
+        assert!(std::fs::read(own_file(out).unwrap()).unwrap() == b"newest" && !partial.exists());
+        flush_to_disk(folder.path(), &["file", "absent"]).unwrap();
     }
 
     #[test]

@@ -8,14 +8,13 @@ mod steady;
 mod tune;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::Write;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Result;
 use serde_json::{Map, Value, json};
 
-use super::{driver, finish, table};
+use super::{driver, finish, print, table};
 use crate::Error;
 use crate::ceilings::Ceiling;
 use crate::gpu::{CheckReport, DeviceChoice, Gpu, PassTime};
@@ -135,12 +134,11 @@ pub fn run(args: &BenchArgs) -> Result<()> {
         scene.gaussians.save(path)?;
     }
     let findings = Findings::gather(&bench, &scene, args)?;
-    let mut out = std::io::stdout().lock();
     if args.json {
-        writeln!(out, "{:#}", findings.as_json(&bench, &scene))?;
+        print(format_args!("{:#}", findings.as_json(&bench, &scene)))?;
     } else {
-        write!(out, "{}", findings.as_text(&bench, &scene))?;
-        finish("", "nightsplat bench --tune")?;
+        print(findings.as_text(&bench, &scene))?;
+        finish("", "nightsplat bench --tune");
     }
     Ok(findings.checked.agree()?)
 }

@@ -2,7 +2,6 @@
 
 mod work;
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
@@ -10,7 +9,7 @@ use clap::Subcommand;
 
 use self::work::work;
 use super::train::TrainOptions;
-use super::{driver, finish, table, word};
+use super::{driver, finish, print, table, tell, word};
 use crate::Error;
 use crate::base::output::{check_writable, printable};
 use crate::blocks::{self, BlockPlan, MAX_ROUNDS, PlanRow, Request};
@@ -140,16 +139,17 @@ fn plan(args: &PlanArgs) -> Result<()> {
     let steps = plan.steps();
     let tasks = if args.dry_run { None } else { Some(plan.save(&args.out)?) };
     if args.json {
-        return Ok(writeln!(std::io::stdout(), "{json:#}")?);
+        return Ok(print(format_args!("{json:#}"))?);
     }
     // What a few views cannot train, such as black ones, is no reason to plan nothing.
     let hours = blocks::speed(&gpu, &planned)
         .map(|(milliseconds, gaussians)| hours(steps, milliseconds, gaussians));
-    write!(std::io::stdout(), "{}{}", printable(&summary), hours.unwrap_or_default())?;
+    tell(printable(&summary).into_owned() + &hours.unwrap_or_default());
     let Some(tasks) = tasks else { return Ok(()) };
     let (city, count) = (args.out.display(), tasks.len());
     let wrote = format!("{city}/plan.toml, law.toml, frame.toml, and {count} tasks in tasks.jsonl");
-    finish(&wrote, &format!("nightsplat blocks run {}", word(&args.out)))
+    finish(&wrote, &format!("nightsplat blocks run {}", word(&args.out)));
+    Ok(())
 }
 
 /// A table of the tasks, and their sums.
@@ -183,10 +183,10 @@ fn run_tasks(args: &RunArgs) -> Result<()> {
     work(&args.city, |task, [number, all], is_done| {
         let state = if is_done { " is done" } else { "" };
         let line = format!("[{number}/{all}] {}{state}", task.id);
-        // A closed standard output does not stop the work.
-        let _ = writeln!(std::io::stdout(), "{line}");
+        tell(line);
     })?;
-    finish("", &next(&args.city))
+    finish("", &next(&args.city));
+    Ok(())
 }
 
 fn join(args: &JoinArgs) -> Result<()> {
@@ -195,11 +195,11 @@ fn join(args: &JoinArgs) -> Result<()> {
     })?;
     let (count, tiles) = (joined.manifest.count, joined.manifest.tiles.len());
     let (cropped, model) = (joined.cropped, &joined.manifest.folder);
-    writeln!(
-        std::io::stdout(),
+    tell(format_args!(
         "{count} Gaussians in {tiles} tiles; {cropped} of the blocks lie outside their cores and are left out"
-    )?;
-    finish(&model.join("manifest.json").display().to_string(), &next(&args.city))
+    ));
+    finish(&model.join("manifest.json").display().to_string(), &next(&args.city));
+    Ok(())
 }
 
 fn next(city: &Path) -> String {

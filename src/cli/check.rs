@@ -1,13 +1,12 @@
 //! `nightsplat check`: compares every pass of some training steps with its CPU reference.
 
-use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Result;
 use serde_json::{Value, json};
 
 use super::train::TrainOptions;
-use super::{driver, finish, table, word};
+use super::{driver, finish, print, table, word};
 use crate::gpu::{CheckReport, CheckedPass, DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::train::Trainer;
@@ -44,15 +43,16 @@ pub fn run(args: &CheckArgs) -> Result<()> {
         report.extend(passes);
         step?;
     }
-    let mut out = std::io::stdout().lock();
     if args.json {
-        writeln!(out, "{:#}", as_json(&gpu, &report))?;
+        print(format_args!("{:#}", as_json(&gpu, &report)))?;
     } else {
-        write!(out, "{}", as_text(&gpu, &report))?;
+        print(as_text(&gpu, &report))?;
     }
     report.agree()?;
-    let next = format!("nightsplat train {} --out run", word(&args.dataset));
-    if args.json { Ok(()) } else { finish("", &next) }
+    if !args.json {
+        finish("", &format!("nightsplat train {} --out run", word(&args.dataset)));
+    }
+    Ok(())
 }
 
 fn as_json(gpu: &Gpu, report: &CheckReport) -> Value {

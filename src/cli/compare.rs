@@ -1,12 +1,11 @@
 //! `nightsplat compare`: runs on one dataset, side by side.
 
-use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Result;
 
 use super::eval::LpipsRange;
-use super::{driver, finish, table, word};
+use super::{driver, finish, print, table, word};
 use crate::Error;
 use crate::base::output::{check_writable, write_whole};
 use crate::gpu::DeviceChoice;
@@ -66,23 +65,22 @@ pub fn run(args: &CompareArgs) -> Result<()> {
         write_whole(path, comparison.html().as_bytes())?;
         wrote = path.display().to_string();
     }
-    let mut out = std::io::stdout().lock();
     if args.json {
-        return Ok(writeln!(out, "{:#}", comparison.json())?);
+        return Ok(print(format_args!("{:#}", comparison.json()))?);
     }
     let tables = [comparison.means(), comparison.views()]
         .map(|table_of_scores| table::text(&table_of_scores));
-    writeln!(out, "{}", tables.join("\n"))?;
+    print(tables.join("\n") + "\n")?;
     for [key, values] in comparison.settings() {
-        writeln!(out, "{key}: {values}")?;
+        print(format_args!("{key}: {values}"))?;
     }
     if let Some(label) = comparison.label() {
-        writeln!(out, "{label}")?;
+        print(label)?;
     }
-    drop(out);
     let next = match &args.report {
         Some(path) => format!("open {} in a browser", word(path)),
         None => "nightsplat compare ... --report compare.html".to_owned(),
     };
-    finish(&wrote, &next)
+    finish(&wrote, &next);
+    Ok(())
 }

@@ -1,11 +1,9 @@
 //! `nightsplat completions`: completion scripts for shells.
 
-use std::io::Write;
-
 use anyhow::Result;
 use clap_complete::Shell;
 
-use super::help;
+use super::{help, print};
 
 /// Print the completion script of a shell
 ///
@@ -20,5 +18,5 @@ pub struct CompletionsArgs {
 pub fn run(args: CompletionsArgs) -> Result<()> {
     let mut script = vec![];
     clap_complete::generate(args.shell, &mut help::command(true), "nightsplat", &mut script);
-    Ok(std::io::stdout().lock().write_all(&script)?)
+    Ok(print(String::from_utf8_lossy(&script))?)
 }

@@ -1,14 +1,13 @@
 //! `nightsplat diagnose`: measures photographs and chooses a model for them, with reasons.
 
 use std::collections::BTreeMap;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use serde::Serialize;
 
 use super::settings::{Selection, SettingOptions, push_dataset};
-use super::{driver, finish, table, word, words};
+use super::{driver, finish, print, table, word, words};
 use crate::Error;
 use crate::base::output::{check_writable, write_whole};
 use crate::gpu::DeviceChoice;
@@ -115,7 +114,7 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     } else {
         text(device, &dataset, &diagnosis, &plan)
     };
-    write!(std::io::stdout(), "{text}")?;
+    print(text)?;
     if args.json {
         return Ok(());
     }
@@ -124,7 +123,8 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     finish(
         &wrote.collect::<Vec<_>>().join(", "),
         &format!("nightsplat train {} --out run{}", word(&args.dataset), plan.unwrap_or_default()),
-    )
+    );
+    Ok(())
 }
 
 /// The residual transmittance of the model of a run in every view, and a remark on it.

@@ -1,13 +1,12 @@
 //! `nightsplat doctor`: the Vulkan devices and whether they can train.
 
 use std::collections::BTreeMap;
-use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Result;
 use serde::Serialize;
 
-use super::finish;
+use super::{finish, print};
 use crate::Error;
 use crate::gpu::{
     CooperativeMatrix, DeviceChoice, DeviceReport, Gpu, SUBGROUP_VARIABLE, SchedulerVariables,
@@ -85,9 +84,12 @@ pub fn run(args: &DoctorArgs) -> Result<()> {
     } else {
         table(&devices, &self_tests) + &program_lines(&programs) + &verdict
     };
-    writeln!(std::io::stdout().lock(), "{}", text.trim_end())?;
+    print(text.trim_end())?;
     checked?;
-    if args.json { Ok(()) } else { finish("", "nightsplat demo, or nightsplat diagnose photos") }
+    if !args.json {
+        finish("", "nightsplat demo, or nightsplat diagnose photos");
+    }
+    Ok(())
 }
 
 /// Opens a device that meets the requirements, which tests it.
@@ -103,12 +105,9 @@ fn described(tested: &Option<crate::Result<()>>) -> Option<String> {
 /// Compiles every kernel. A driver that crashes ends the process, and the last line names the kernel.
 fn compile(index: usize) -> Result<()> {
     let mut printed = Ok(());
-    let mut print = |kernel: &str| {
-        let mut out = std::io::stdout().lock();
-        printed = writeln!(out, "{kernel}").and_then(|()| out.flush());
-    };
-    print("self_test");
-    Gpu::new(&DeviceChoice::Index(index))?.compile_all(print)?;
+    let mut name = |kernel: &str| printed = print(kernel);
+    name("self_test");
+    Gpu::new(&DeviceChoice::Index(index))?.compile_all(name)?;
     Ok(printed?)
 }
 

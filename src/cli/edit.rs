@@ -2,13 +2,12 @@
 
 mod operations;
 
-use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Result;
 
 use self::operations::Operations;
-use super::{driver, finish, word};
+use super::{driver, finish, tell, word};
 use crate::Error;
 use crate::base::output::{check_writable, printable};
 use crate::gpu::DeviceChoice;
@@ -68,16 +67,15 @@ pub fn run(args: &EditArgs) -> Result<()> {
         editor.check_list(path, list)?;
     }
     let listed = list.iter().flat_map(|list| &list.edits);
-    let mut out = std::io::stdout().lock();
     for operation in listed.chain(args.operations.iter()) {
-        writeln!(out, "{}", printable(&editor.apply(operation)?))?;
+        tell(printable(&editor.apply(operation)?));
     }
-    drop(out);
     let mut wrote = editor.save(&args.out)?;
     if let Some(path) = &args.save_edits {
         editor.save_list(path)?;
         wrote += &format!(", {}", path.display());
     }
     let next = format!("nightsplat export {} --format html --dataset DIR", word(&args.out));
-    finish(&wrote, &next)
+    finish(&wrote, &next);
+    Ok(())
 }

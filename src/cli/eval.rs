@@ -1,12 +1,11 @@
 //! `nightsplat eval`: scores a run on its test views.
 
-use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Result;
 use indicatif::ProgressBar;
 
-use super::{driver, finish, progress_bar, table, word};
+use super::{driver, finish, print, progress_bar, table, word};
 use crate::Error;
 use crate::base::output::{check_writable, printable, write_whole};
 use crate::gpu::DeviceChoice;
@@ -117,14 +116,13 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     if let Some(path) = &args.report {
         write_whole(path, scored.html().as_bytes())?;
     }
-    let mut out = std::io::stdout().lock();
     if args.json {
-        return Ok(writeln!(out, "{:#}", scored.json())?);
+        return Ok(print(format_args!("{:#}", scored.json()))?);
     }
-    write!(out, "{}", table::text(&scored.evaluation.table()))?;
-    scored.notes().iter().try_for_each(|note| writeln!(out, "{note}"))?;
-    drop(out);
+    print(table::text(&scored.evaluation.table()))?;
+    scored.notes().iter().try_for_each(print)?;
     let wrote = args.report.iter().chain(&images).map(|path| path.display().to_string());
     let next = format!("nightsplat render {} --split all --out pictures", word(&args.run));
-    finish(&wrote.collect::<Vec<_>>().join(", "), &next)
+    finish(&wrote.collect::<Vec<_>>().join(", "), &next);
+    Ok(())
 }

@@ -76,7 +76,8 @@ pub fn run(args: &ExportArgs) -> Result<()> {
         Format::StreamedSog => format!("serve {out} and open its {} in a viewer", streamed::INDEX),
         Format::Ply => format!("open {out} in a viewer of 3DGS models"),
     };
-    finish(&line(&args.run, &written), &next)
+    finish(&line(&args.run, &written), &next);
+    Ok(())
 }
 
 /// Writes the file without a message.

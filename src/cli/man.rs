@@ -29,7 +29,8 @@ pub fn run(args: &ManArgs) -> anyhow::Result<()> {
         let name = Man::new(command.clone()).get_filename();
         write_whole(&args.dir.join(name), &page(command).map_err(problem)?)?;
     }
-    finish(&format!("man pages to {}", args.dir.display()), "man nightsplat")
+    finish(&format!("man pages to {}", args.dir.display()), "man nightsplat");
+    Ok(())
 }
 
 /// The page of a command. Its examples keep their lines.

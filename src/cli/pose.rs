@@ -1,14 +1,13 @@
 //! `nightsplat pose`: estimates the cameras of photographs with COLMAP.
 
 use std::cell::RefCell;
-use std::io::Write;
 use std::path::PathBuf;
 use std::time::Instant;
 
 use anyhow::Result;
 use indicatif::ProgressBar;
 
-use super::{driver, finish, progress_bar, word};
+use super::{driver, finish, progress_bar, tell_on_stderr, word};
 use crate::gpu::DeviceChoice;
 use crate::photographs::image::StoredLight;
 use crate::photographs::pose::{
@@ -87,9 +86,8 @@ pub fn run(args: &PoseArgs) -> Result<()> {
     let Posed { photographs, placed, bright, lenses } =
         estimate(&args.options(), &|progress| match progress {
             PoseProgress::Line(line) => {
-                // A closed standard error is no reason to stop.
                 let seconds = begin.elapsed().as_secs_f64();
-                let _ = writeln!(std::io::stderr(), "{seconds:5.0} s  {line}");
+                tell_on_stderr(format_args!("{seconds:5.0} s  {line}"));
             }
             PoseProgress::Photographs { done, all } => {
                 let mut bar = bar.borrow_mut();
@@ -107,7 +105,8 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         if lenses.len() == 1 { "one".to_owned() } else { lenses.len().to_string() },
         lenses.iter().take(MAX_LISTED).map(describe).collect::<Vec<_>>().join("; ")
     );
-    finish(&wrote, &format!("nightsplat train {} --out run", word(&args.out)))
+    finish(&wrote, &format!("nightsplat train {} --out run", word(&args.out)));
+    Ok(())
 }
 
 impl PoseArgs {

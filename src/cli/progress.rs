@@ -1,12 +1,12 @@
 //! Progress of a run as a bar, lines or JSON.
 
-use std::io::{IsTerminal, Write};
+use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Map, Value, json};
 
-use super::phases;
+use super::{phases, tell, tell_on_stderr};
 use crate::results::eval::{After, Evaluation, Metric, ReferenceKind};
 use crate::results::run::Event;
 use crate::train::{MemoryEstimate, StepReport};
@@ -110,7 +110,7 @@ impl Reporter {
     fn draw(&mut self, event: Event<'_>) {
         match event {
             Event::Started { step, memory, .. } => {
-                print_line(&foreseen(memory));
+                tell_on_stderr(foreseen(memory));
                 self.bar = ProgressBar::new(self.steps).with_position(step);
                 self.bar.set_style(style(self.may_end_early));
             }
@@ -125,7 +125,7 @@ impl Reporter {
             }
             Event::Evaluated { step, evaluation } => {
                 if let Some(line) = summary(evaluation).filter(|_| step < self.steps) {
-                    self.bar.suspend(|| print_line(&format!("step {step}: {line}")));
+                    self.bar.suspend(|| tell_on_stderr(format!("step {step}: {line}")));
                 }
             }
             Event::Finished(_) => self.bar.finish_and_clear(),
@@ -135,16 +135,16 @@ impl Reporter {
 
     fn write(&mut self, event: Event<'_>) {
         match event {
-            Event::Started { memory, .. } => print_line(&foreseen(memory)),
-            Event::Step(report) if self.is_due() => print_line(&self.line(report)),
+            Event::Started { memory, .. } => tell_on_stderr(foreseen(memory)),
+            Event::Step(report) if self.is_due() => tell_on_stderr(self.line(report)),
             Event::HeldOut { step, psnr } => {
-                print_line(&format!(
+                tell_on_stderr(format!(
                     "step {step}: held-out views {psnr:.2} dB against their targets"
                 ));
             }
             Event::Evaluated { step, evaluation } => {
                 if let Some(line) = summary(evaluation).filter(|_| step < self.steps) {
-                    print_line(&format!("step {step}: {line}"));
+                    tell_on_stderr(format!("step {step}: {line}"));
                 }
             }
             _ => {}
@@ -200,8 +200,7 @@ impl Reporter {
             }
             _ => return,
         };
-        // A closed pipe does not stop the run.
-        let _ = writeln!(std::io::stdout(), "{line}");
+        tell(line);
     }
 
     fn is_due(&mut self) -> bool {
@@ -269,11 +268,6 @@ fn duration(seconds: f64) -> String {
         seconds @ 60..3600 => format!("{} min {} s", seconds / 60, seconds % 60),
         seconds => format!("{} h {} min", seconds / 3600, seconds % 3600 / 60),
     }
-}
-
-fn print_line(line: &str) {
-    // A closed standard error is no reason to stop.
-    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 /// The bar: step, loss, Gaussians, steps per second and time left.

@@ -340,7 +340,8 @@ pub fn run(args: &RenderArgs) -> Result<()> {
         video::make(video, out, &files, fps)?;
         wrote += &format!(", {}", video.display());
     }
-    finish(&wrote, &format!("nightsplat export {} --format html", word(run)))
+    finish(&wrote, &format!("nightsplat export {} --format html", word(run)));
+    Ok(())
 }
 
 fn file(folder: &Path, name: &str, format: OutputFormat) -> PathBuf {

@@ -23,7 +23,6 @@ mod scenes;
 mod scores;
 mod table;
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
@@ -39,7 +38,7 @@ pub(super) use self::run::parsed;
 use self::run::{Run, absolute, difference};
 use self::runner::FailedPoint;
 use super::eval::LpipsRange;
-use super::{driver, finish, progress_bar};
+use super::{driver, finish, print, progress_bar, tell};
 use crate::Error;
 use crate::base::input;
 use crate::base::output::{check_writable, create_folder, write_whole};
@@ -153,10 +152,9 @@ fn swept(
         open(first)?;
     }
     claim(args, &runs)?;
-    let mut out = std::io::stdout().lock();
     if args.dry_run {
         for run in left {
-            writeln!(out, "{}", run.command_line()?)?;
+            print(run.command_line()?)?;
         }
         return Ok(None);
     }
@@ -189,12 +187,12 @@ fn swept(
     leaderboard.save(&args.out, pictures)?;
     rows.save_costs(&args.out, title, &leaderboard.notes())?;
     if args.json {
-        writeln!(out, "{:#}", rows.json(&dataset.root, &failures))?;
+        print(format_args!("{:#}", rows.json(&dataset.root, &failures)))?;
     } else {
         let tables = [leaderboard.table(), rows.costs()].map(|table| super::table::text(&table));
-        writeln!(out, "{}", tables.join("\n"))?;
+        tell(tables.join("\n") + "\n");
         let out = args.out.display();
-        finish(&format!("{out}/index.html, {out}/costs.html"), &format!("open {out}/index.html"))?;
+        finish(&format!("{out}/index.html, {out}/costs.html"), &format!("open {out}/index.html"));
     }
     Ok(Some((rows, failures)))
 }

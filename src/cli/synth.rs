@@ -75,5 +75,6 @@ pub fn run(args: SynthArgs) -> anyhow::Result<()> {
     synthetic::write_captured(&dir, &options, &capture)?;
     let SyntheticOptions { views, width, height, .. } = options;
     let wrote = format!("{}: {views} views of {width}x{height}", dir.display());
-    finish(&wrote, &format!("nightsplat train {} --out run", word(&dir)))
+    finish(&wrote, &format!("nightsplat train {} --out run", word(&dir)));
+    Ok(())
 }

@@ -2,7 +2,6 @@
 
 mod options;
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -11,7 +10,7 @@ use anyhow::Result;
 pub(crate) use self::options::TrainOptions;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
-use super::{driver, finish, live, phases, signals, view, word};
+use super::{driver, finish, live, phases, print, signals, tell, view, word};
 use crate::base::output::{check_writable, printable};
 use crate::camera::frame;
 use crate::gpu::DeviceChoice;
@@ -28,9 +27,9 @@ use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 /// is chosen from that; options override it. With --config, or a preset that states every setting (paper and the
 /// benchmarks), nothing is chosen.
 ///
-/// SIGINT and SIGTERM save a checkpoint and stop, with exit code 130 or 143; a second signal ends the process at
-/// once. SIGUSR1 saves a checkpoint and continues. --resume continues a run to the same bits; on a finished run it
-/// does nothing.
+/// SIGINT, SIGTERM and SIGHUP save a checkpoint and stop, with exit code 130, 143 or 129; another a second later or
+/// more ends the process at once. Under nohup, SIGHUP does nothing. SIGUSR1 saves a checkpoint and continues. --resume
+/// continues a run to the same bits; on a finished run it does nothing.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLE)]
 pub struct TrainArgs {
@@ -93,7 +92,8 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         && !args.explain
         && let Some(steps) = done_by_stamp(args, &requested, file.as_deref())?
     {
-        return print_done(args, steps);
+        tell_done(args, steps);
+        return Ok(());
     }
     let device = requested.settings(None)?.config()?.device;
     let choice = device.parse::<DeviceChoice>()?;
@@ -101,22 +101,22 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let planning = planning(args, file.as_deref(), is_resumed);
     let PlannedRun { config, settings, plan, dataset } = requested.planned(planning, &gpu)?;
     if args.explain {
-        return Ok(write!(std::io::stdout(), "{}", printable(&settings.explained(&config)?))?);
+        return Ok(print(printable(&settings.explained(&config)?))?);
     }
     for line in args.options.idle(&config) {
         tracing::warn!("{line}");
     }
     let finished = if args.resume { run::done_steps(&args.out, &config, &dataset)? } else { None };
     if let Some(steps) = finished {
-        return print_done(args, steps);
+        tell_done(args, steps);
+        return Ok(());
     }
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
     let (is_text, is_quiet) = (form != ProgressForm::Json, form == ProgressForm::None);
-    let mut out = std::io::stdout();
     let facts = RunFacts::new(&gpu, &config, plan.as_ref(), &dataset);
     if is_text && !is_quiet {
         let plan = plan.as_ref().map(diagnose::decisions).unwrap_or_default();
-        write!(out, "{}{plan}", facts.text())?;
+        tell(facts.text() + &plan);
     }
     let if_exists =
         if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
@@ -146,24 +146,25 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         return Ok(());
     }
     let gaussians = trainer.gaussian_count();
-    writeln!(out, "{ended}")?;
+    tell(ended);
     if let Some(line) = summary(&evaluation) {
-        writeln!(out, "{line}")?;
+        tell(line);
     }
     if let Some(reference_settings) = config.tone.knows_references() {
-        writeln!(out, "{}", eval::with_reference(&reference_settings))?;
+        tell(eval::with_reference(&reference_settings));
     }
     if let Some(label) = evaluation.label() {
-        writeln!(out, "the scores are {label}")?;
+        tell(format_args!("the scores are {label}"));
     }
     let (steps, seconds) = (trainer.steps_done(), spent.seconds);
-    writeln!(out, "{steps} steps, {gaussians} Gaussians, {seconds:.0} s")?;
+    tell(format_args!("{steps} steps, {gaussians} Gaussians, {seconds:.0} s"));
     let frame = run::load_config(&args.out)?.frame.unwrap_or_default();
     if let Some(line) = frame::relative_to(frame.file_origin()) {
-        writeln!(out, "model.ply: {line}")?;
+        tell(format_args!("model.ply: {line}"));
     }
     let run = args.out.display();
-    finish(&format!("{run}/model.ply, {run}/metrics.json"), &next(args))
+    finish(&format!("{run}/model.ply, {run}/metrics.json"), &next(args));
+    Ok(())
 }
 
 /// The command to run after training.
@@ -172,10 +173,10 @@ fn next(args: &TrainArgs) -> String {
     format!("nightsplat export {run} --format html  (then open {run}/model.html)")
 }
 
-fn print_done(args: &TrainArgs, steps: u64) -> Result<()> {
+fn tell_done(args: &TrainArgs, steps: u64) {
     let done = format!("{} is done: {steps} steps", args.out.display());
-    writeln!(std::io::stdout(), "{}", printable(&done))?;
-    finish("", &next(args))
+    tell(printable(&done));
+    finish("", &next(args));
 }
 
 /// The step count of the run to resume if it is finished and the files of its dataset are unchanged. Decodes nothing.

@@ -78,5 +78,6 @@ pub fn run(args: &VaryArgs) -> anyhow::Result<()> {
     let variation = Variation { stops: *stops, gamma: gamma.0, seed: *seed };
     let count = varied::write(out, &dataset, &variation)?;
     let wrote = format!("{}: {count} photographs, up to {stops} stops off", out.display());
-    finish(&wrote, &format!("nightsplat train {} --out run", word(out)))
+    finish(&wrote, &format!("nightsplat train {} --out run", word(out)));
+    Ok(())
 }

@@ -1,14 +1,13 @@
 //! `nightsplat view`: a live page of a run, a model or a dataset.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 use anyhow::Result;
 use glam::{DAffine3, DVec3, Vec3};
 
-use super::driver;
 use super::live::{DEFAULT_ADDRESS, Feed, Listen, Pictures, Server, Site};
+use super::{driver, tell_on_stderr};
 use crate::camera::Camera;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
@@ -75,7 +74,7 @@ pub(super) fn of_training(
 /// Starts the server and prints the address of the page.
 fn started(listen: Listen, site: Arc<Site>) -> Result<Server> {
     let server = Server::start(listen, site)?;
-    writeln!(std::io::stderr(), "open {} in a browser", server.url())?;
+    tell_on_stderr(format_args!("open {} in a browser", server.url()));
     Ok(server)
 }
 

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use crate::base::output::own_file;
 use crate::camera::{Camera, TrainingFrame};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
@@ -204,10 +205,10 @@ impl ScoredImages<'_> {
             _ => "targets",
         };
         for (name, image) in [("renders", &self.render), (targets, &self.target)] {
-            let folder = folder.join(name);
+            let folder = own_file(own_file(folder.to_owned())?.join(name))?;
             std::fs::create_dir_all(&folder)
                 .map_err(|error| Error::output(&folder, format!("cannot be created ({error})")))?;
-            let path = folder.join(format!("{}.png", self.view.name));
+            let path = own_file(folder.join(format!("{}.png", self.view.name)))?;
             self.view.upright(image.clone()).save_png8(path)?;
         }
         Ok(())

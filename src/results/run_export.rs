@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use glam::{DQuat, DVec3};
 
 use self::up::{Turn, Up};
-use crate::base::output::{is_same_file, write_whole};
+use crate::base::output::{is_same_file, own_file, write_whole};
 use crate::photographs::dataset::Dataset;
 use crate::photographs::targets::SceneTone;
 use crate::results::export::streamed::{self, Division, TileLoader, Written};
@@ -85,7 +85,7 @@ impl ExportOptions<'_> {
                 load: Box::new(move || Ok(Cow::Owned(turned(manifest.read(tile)?, rotation)))),
             })
             .collect();
-        let path = self.out.map_or_else(|| self.default_path(), Path::to_owned);
+        let path = self.path()?;
         let written = streamed::write(&path, &tiles, &provenance, self.division)?;
         let (count, origin) = (written.counts[0], DVec3::ZERO);
         Ok(Exported { path, count, streamed: Some(written), origin, turn })
@@ -98,11 +98,12 @@ impl ExportOptions<'_> {
             false => (gaussians, facts),
         };
         let default_path = self.default_path();
-        let path = self.out.unwrap_or(&default_path).to_owned();
-        if self.format == Format::Ply && is_same_file(&path, &default_path) {
+        let named = self.out.unwrap_or(&default_path);
+        if self.format == Format::Ply && is_same_file(named, &default_path) {
             let problem = "is the model itself; name another file with --out";
-            return Err(Error::output(path, problem));
+            return Err(Error::output(named, problem));
         }
+        let path = self.path()?;
         let source = self.source.display();
         if let Some(step) = run::stopped_at(self.source) {
             tracing::warn!("{source}: stopped at step {step} of {}", config.steps);
@@ -200,6 +201,15 @@ impl ExportOptions<'_> {
             curve: config.tone.curve.to_string(),
             exposure: exposure.unwrap_or_else(|| "that of its targets".to_owned()),
             ..Provenance::default()
+        }
+    }
+
+    /// The file to write. In a run, it replaces a link.
+    fn path(&self) -> Result<PathBuf> {
+        match self.out {
+            Some(out) => Ok(out.to_owned()),
+            None if is_model(self.source) => Ok(self.default_path()),
+            None => own_file(self.default_path()),
         }
     }
 

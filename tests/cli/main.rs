@@ -24,6 +24,7 @@ mod stress;
 mod sweep;
 mod tone_command;
 mod tuning;
+mod unread;
 use common::command::{refused, succeed};
 use common::copy;
 

@@ -7,16 +7,18 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
+use nightsplat::gpu::testing::not_run;
+
 use crate::common::command::{command, refused, run, succeed};
 use crate::common::workspace::{Workspace, log};
 
 /// A training that has started and has thousands of steps to go.
 fn begun(arguments: &str) -> Child {
-    let mut child = command(&format!("{arguments} --progress json"))
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
+    started(&mut command(&format!("{arguments} --progress json")))
+}
+
+fn started(command: &mut Command) -> Child {
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut line = String::new();
     BufReader::new(child.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
     assert!(line.contains("started"), "{line}");
@@ -89,10 +91,40 @@ fn a_run_saves_on_request_and_when_its_checkpoint_is_old_and_continues() {
         &workspace.train("old", "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0.01"),
     );
     wait_for(&workspace.path("old/checkpoint.before.safetensors"));
+    // From a terminal, and from a parent that forwards it.
     send("-INT", &child);
     send("-INT", &child);
     let (code, stderr) = ended(child);
-    assert_eq!(code, 130, "{stderr}");
+    assert!(code == 130 && stderr.contains("and saved"), "{code}: {stderr}");
+}
+
+#[test]
+fn a_closed_terminal_saves_and_stops_unless_the_run_was_started_to_outlive_it() {
+    let ignores = Command::new("sh").args(["-c", "kill -HUP $$"]).status().unwrap().success();
+    if ignores {
+        return not_run("terminal", "the tests were started to outlive theirs, as by nohup");
+    }
+    let workspace = Workspace::new();
+    let endless = "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0";
+    let child = begun(&workspace.train("closed", endless));
+    send("-HUP", &child);
+    let (code, stderr) = ended(child);
+    assert!(code == 129 && stderr.contains("hung up after step"), "{code}: {stderr}");
+    assert!(workspace.path("closed/checkpoint.safetensors").exists());
+
+    // As `nohup` starts it.
+    let train = workspace.train("outlives", &format!("{endless} --progress json"));
+    let (program, line) = (command("").get_program().to_owned(), "trap '' HUP; exec \"$@\"");
+    let mut shell = Command::new("sh");
+    shell.args(["-c", line, "sh"]).arg(program).args(train.split_whitespace());
+    let mut child = started(&mut shell);
+    send("-HUP", &child);
+    send("-USR1", &child);
+    wait_for(&workspace.path("outlives/checkpoint.safetensors"));
+    assert!(child.try_wait().unwrap().is_none(), "it is gone");
+    send("-INT", &child);
+    let (code, stderr) = ended(child);
+    assert!(code == 130 && stderr.contains("and saved"), "{code}: {stderr}");
 }
 
 #[test]

@@ -1,13 +1,11 @@
 //! `--tune`: times the rasteriser with every tile size that the device supports, and stores the fastest.
 
-use std::io::Write;
-
 use anyhow::Result;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use super::scene::BenchScene;
-use super::{Bench, finish, median, stages, table, total};
+use super::{Bench, finish, median, print, stages, table, total};
 use crate::camera::Camera;
 use crate::gpu::{Buffer, Resources, TUNE_VARIABLE, Tile, TunedTile};
 use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
@@ -58,7 +56,6 @@ pub(super) fn run(bench: &Bench, sizes: &[[u32; 2]], as_json: bool) -> Result<()
     }
     let chosen: Vec<_> = FEATURES.iter().filter_map(|f| fastest(&cases, f.channels())).collect();
     let file = bench.gpu.keep_tuned_tiles(&chosen)?;
-    let mut out = std::io::stdout().lock();
     if as_json {
         let properties = bench.gpu.properties();
         let report = json!({
@@ -71,23 +68,23 @@ pub(super) fn run(bench: &Bench, sizes: &[[u32; 2]], as_json: bool) -> Result<()
             "tiles": chosen,
             "file": file,
         });
-        writeln!(out, "{report:#}")?;
-        return Ok(());
+        return Ok(print(format_args!("{report:#}"))?);
     }
     for case in &cases {
-        writeln!(out, "{}", case.as_text())?;
+        print(case.as_text())?;
     }
     if !bench.gpu.properties().has_pipeline_statistics {
-        writeln!(out, "registers and spills: not reported by the driver")?;
+        print("registers and spills: not reported by the driver")?;
     }
     let tile = |TunedTile { channels, tile }: &TunedTile| format!("{tile} at {channels} channels");
     let fastest = chosen.iter().map(tile).collect::<Vec<_>>().join(", ");
     match &file {
-        Some(_) => writeln!(out, "fastest: {fastest}")?,
-        None => writeln!(out, "fastest: {fastest}; not stored, as {TUNE_VARIABLE} is off")?,
+        Some(_) => print(format_args!("fastest: {fastest}"))?,
+        None => print(format_args!("fastest: {fastest}; not stored, as {TUNE_VARIABLE} is off"))?,
     }
     let wrote = file.map(|file| file.display().to_string()).unwrap_or_default();
-    finish(&wrote, "nightsplat train photos --out run")
+    finish(&wrote, "nightsplat train photos --out run");
+    Ok(())
 }
 
 /// The tile with the least sum over sizes of its time relative to the fastest at that size. One whose kernels spill is

@@ -22,9 +22,10 @@ pub(super) fn work(folder: &Path, mut begin: impl FnMut(&Task, [usize; 2], bool)
         let status = run(folder, task, &requests).map_err(|error| {
             Error::input(folder, format!("task {} cannot be started: {error}", task.id))
         })?;
-        let stops = [Stop::Interrupted, Stop::Terminated, Stop::TimeUp];
-        let stopped = stops.into_iter().find(|stop| status.code() == Some(stop.exit_code().into()));
-        if let Some(cause) = stopped.or(requests.stops()) {
+        let stopped =
+            Stop::ALL.into_iter().find(|stop| status.code() == Some(stop.exit_code().into()));
+        // The signal that came is the cause, not that by which it was passed on.
+        if let Some(cause) = requests.stops().or(stopped) {
             let (folder, done) = (folder.to_owned(), number - 1);
             return Err(Error::BatchStopped { folder, done, all: tasks.len(), cause });
         }

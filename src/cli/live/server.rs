@@ -3,29 +3,33 @@
 use std::convert::Infallible;
 use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use http_body_util::Full;
 use hyper::body::{Bytes, Incoming};
 use hyper::header::{
-    CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderName, HeaderValue, REFERRER_POLICY,
-    X_CONTENT_TYPE_OPTIONS, X_FRAME_OPTIONS,
+    CACHE_CONTROL, CONNECTION, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderName, HeaderValue,
+    REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS, X_FRAME_OPTIONS,
 };
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
-use hyper::{Request, Response};
+use hyper::{Method, Request, Response};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::net::TcpStream;
-use tokio::sync::{Semaphore, oneshot};
+use tokio::sync::oneshot;
+use tokio::task::AbortHandle;
 
 use super::listen::Listen;
 use super::site::{Answer, Site};
 use crate::base::hash;
 use crate::{Error, Result};
 
-/// The most connections at a time; others are closed at once.
+/// The most connections at a time. One more takes the place of the first that has not shown the token within
+/// [`TOKEN_WITHIN`], or is closed at once.
 const CONNECTIONS: usize = 64;
+const TOKEN_WITHIN: Duration = Duration::from_secs(2);
 /// The most threads that read files and compute images.
 const WORKERS: usize = 2;
 /// A client that sends its headers more slowly is cut off.
@@ -123,29 +127,54 @@ fn token() -> Result<String> {
     Ok(hash::hexadecimal(&bytes))
 }
 
-async fn accept(listener: TcpListener, prefix: String, site: Arc<Site>) {
-    let Ok(listener) = tokio::net::TcpListener::from_std(listener) else { return };
-    let (free, prefix) = (Arc::new(Semaphore::new(CONNECTIONS)), Arc::<str>::from(prefix));
-    loop {
-        match (listener.accept().await, Arc::clone(&free).try_acquire_owned()) {
-            (Ok((stream, _)), Ok(permit)) => {
-                let (prefix, site) = (Arc::clone(&prefix), Arc::clone(&site));
-                tokio::spawn(async move {
-                    serve(stream, prefix, site).await;
-                    drop(permit);
-                });
-            }
-            (Ok((stream, _)), Err(_)) => drop(stream),
-            (Err(_), _) => tokio::time::sleep(AFTER_REFUSAL).await,
-        }
+/// A connection that is served.
+struct Connection {
+    task: AbortHandle,
+    begin: Instant,
+    /// Whether a request had the token.
+    is_known: Arc<AtomicBool>,
+}
+
+impl Connection {
+    fn yields(&self) -> bool {
+        !self.is_known.load(Ordering::Relaxed) && self.begin.elapsed() >= TOKEN_WITHIN
     }
 }
 
-/// Answers the requests of one connection.
-async fn serve(stream: TcpStream, prefix: Arc<str>, site: Arc<Site>) {
+async fn accept(listener: TcpListener, prefix: String, site: Arc<Site>) {
+    let Ok(listener) = tokio::net::TcpListener::from_std(listener) else { return };
+    let (prefix, mut open) = (Arc::<str>::from(prefix), Vec::<Connection>::new());
+    loop {
+        let Ok((stream, _)) = listener.accept().await else {
+            tokio::time::sleep(AFTER_REFUSAL).await;
+            continue;
+        };
+        open.retain(|connection| !connection.task.is_finished());
+        if open.len() >= CONNECTIONS {
+            let Some(first) = open.iter().position(Connection::yields) else { continue };
+            open.remove(first).task.abort();
+        }
+        let is_known = Arc::new(AtomicBool::new(false));
+        let serving = serve(stream, Arc::clone(&prefix), Arc::clone(&site), Arc::clone(&is_known));
+        let task = tokio::spawn(serving).abort_handle();
+        open.push(Connection { task, begin: Instant::now(), is_known });
+    }
+}
+
+/// Answers the requests of one connection. The first without the token is its last.
+async fn serve(stream: TcpStream, prefix: Arc<str>, site: Arc<Site>, is_known: Arc<AtomicBool>) {
     let answer = move |request: Request<Incoming>| {
         let (prefix, site) = (Arc::clone(&prefix), Arc::clone(&site));
-        async move { Ok::<_, Infallible>(response(answer(&request, &prefix, site).await)) }
+        let is_known = Arc::clone(&is_known);
+        async move {
+            let Some(path) = within(request.uri().path(), &prefix) else {
+                let mut response = response(Answer::NOT_FOUND);
+                response.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
+                return Ok::<_, Infallible>(response);
+            };
+            is_known.store(true, Ordering::Relaxed);
+            Ok(response(answer(request.method().clone(), path.to_owned(), site).await))
+        }
     };
     let serving = http1::Builder::new()
         .timer(TokioTimer::new())
@@ -156,9 +185,7 @@ async fn serve(stream: TcpStream, prefix: Arc<str>, site: Arc<Site>) {
     let _ = tokio::time::timeout(CONNECTION_WITHIN, serving).await;
 }
 
-async fn answer(request: &Request<Incoming>, prefix: &str, site: Arc<Site>) -> Answer {
-    let Some(path) = within(request.uri().path(), prefix) else { return Answer::NOT_FOUND };
-    let (method, path) = (request.method().clone(), path.to_owned());
+async fn answer(method: Method, path: String, site: Arc<Site>) -> Answer {
     let answer = tokio::task::spawn_blocking(move || site.answer(&method, &path)).await;
     answer.unwrap_or(Answer::FAILED)
 }
@@ -179,4 +206,65 @@ fn response(Answer { status, kind, body }: Answer) -> Response<Full<Bytes>> {
         headers.insert(name, HeaderValue::from_static(value));
     }
     response
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{Read, Write};
+
+    use super::*;
+    use crate::cli::live::Feed;
+    use crate::splats::scene::Gaussians;
+
+    fn server() -> Server {
+        let feed = Feed::of_gaussians(&Gaussians::zeros(1, 0));
+        let site = Site { html: "the page".into(), feed, pictures: None };
+        Server::start("127.0.0.1:0".parse().unwrap(), Arc::new(site)).unwrap()
+    }
+
+    fn connected(server: &Server) -> std::net::TcpStream {
+        let stream = std::net::TcpStream::connect(server.address).unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+        stream
+    }
+
+    fn ask(stream: &mut std::net::TcpStream, path: &str) -> std::io::Result<()> {
+        stream.write_all(format!("GET {path} HTTP/1.1\r\nHost: x\r\n\r\n").as_bytes())
+    }
+
+    /// The answer to a request that keeps the connection; empty if the server closed it.
+    fn answer(stream: &mut std::net::TcpStream, path: &str) -> String {
+        let mut bytes = vec![0; 4096];
+        let read = ask(stream, path).and_then(|()| stream.read(&mut bytes)).unwrap_or_default();
+        String::from_utf8_lossy(&bytes[..read]).into_owned()
+    }
+
+    #[test]
+    fn a_wrong_token_ends_its_connection_and_the_right_one_keeps_it() {
+        let server = server();
+        let mut stream = connected(&server);
+        for path in ["", "state", "no such path"] {
+            let path = format!("/{}/{path}", server.token).replace(' ', "");
+            assert!(answer(&mut stream, &path).starts_with("HTTP/1.1 "), "{path}");
+        }
+        ask(&mut stream, "/state").unwrap();
+        let mut refused = String::new();
+        stream.read_to_string(&mut refused).unwrap();
+        assert!(refused.starts_with("HTTP/1.1 404") && refused.contains("connection: close"));
+    }
+
+    #[test]
+    fn connections_without_the_token_do_not_lock_out_one_with_it() {
+        let server = server();
+        let page = format!("/{}/", server.token);
+        let mut owner = connected(&server);
+        assert!(answer(&mut owner, &page).contains("the page"));
+        let _held: Vec<_> = (0..CONNECTIONS).map(|_| connected(&server)).collect();
+        assert_eq!(answer(&mut connected(&server), &page), "", "all places are taken");
+        std::thread::sleep(TOKEN_WITHIN);
+        for _ in 0..3 {
+            assert!(answer(&mut connected(&server), &page).contains("the page"));
+        }
+        assert!(answer(&mut owner, &page).contains("the page"), "who is known stays");
+    }
 }

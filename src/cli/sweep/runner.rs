@@ -15,7 +15,8 @@ use std::time::{Duration, Instant};
 use indicatif::ProgressBar;
 
 use super::run::Run;
-use crate::cli::{child, signals};
+use crate::base::output::own_file;
+use crate::cli::{child, signals, tell_on_stderr};
 use crate::results::run::Requests;
 use crate::{Error, Result, Stop};
 
@@ -59,8 +60,7 @@ pub(super) fn train(
             let state = if failure.is_none() { "finished" } else { "failed" };
             let seconds = begin.elapsed().as_secs_f64();
             let line = format!("{done} of {of}: {} {state}, {seconds:.0} s", run.name);
-            // A closed standard error does not stop the sweep.
-            let _ = writeln!(std::io::stderr(), "{line}");
+            tell_on_stderr(line);
         }
         if let Some(reason) = failure {
             bar.suspend(|| tracing::warn!("{} failed: {reason}", run.name));
@@ -116,7 +116,7 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<RunState> {
     let unusable =
         |error: std::io::Error| Error::output(&run.folder, format!("cannot be used: {error}"));
     std::fs::create_dir_all(&run.folder).map_err(unusable)?;
-    let lock = File::create(run.folder.join("lock")).map_err(unusable)?;
+    let lock = File::create(own_file(run.folder.join("lock"))?).map_err(unusable)?;
     match lock.try_lock() {
         Err(TryLockError::WouldBlock) if waits => lock.lock().map_err(unusable)?,
         Err(TryLockError::WouldBlock) => return Ok(RunState::Busy),
@@ -126,7 +126,7 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<RunState> {
     if run.is_finished()? {
         return Ok(RunState::Finished);
     }
-    let log = run.folder.join("log.txt");
+    let log = own_file(run.folder.join("log.txt"))?;
     let mut output = File::create(&log).map_err(unusable)?;
     writeln!(output, "{}", run.command_line()?).map_err(unusable)?;
     let mut process = child::command()
@@ -141,8 +141,7 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<RunState> {
     if status.success() && run.is_finished()? {
         return Ok(RunState::Finished);
     }
-    let stops = [Stop::Interrupted, Stop::Terminated, Stop::TimeUp];
-    if stops.iter().any(|stop| status.code() == Some(stop.exit_code().into())) {
+    if Stop::ALL.iter().any(|stop| status.code() == Some(stop.exit_code().into())) {
         return Ok(RunState::Saved);
     }
     let printed = std::fs::read(&log).unwrap_or_default();

@@ -7,7 +7,6 @@
 //!     scenes.tex      the rows of scenes.md for LaTeX
 //! ```
 
-use std::io::Write;
 use std::path::Path;
 
 use anyhow::Result;
@@ -16,7 +15,7 @@ use super::SweepArgs;
 use super::rows::{SweepResults, SweepRow, number};
 use crate::Error;
 use crate::base::output::{csv_field, printable, write_whole};
-use crate::cli::finish;
+use crate::cli::{finish, tell};
 use crate::networks::lpips::LpipsVersion;
 
 /// The tables, which a later sweep of the folder replaces.
@@ -63,12 +62,12 @@ pub(super) fn run(args: &SweepArgs) -> Result<()> {
     let table = SceneTable::new(&scenes);
     save(&table, &args.out)?;
     if !args.json {
-        writeln!(std::io::stdout(), "{}", printable(&table.markdown()))?;
+        tell(printable(&table.markdown()).into_owned() + "\n");
         let out = args.out.display();
         finish(
             &format!("{out}/scenes.md, {out}/scenes.csv, {out}/scenes.tex"),
             &format!("open {out}/scenes.md"),
-        )?;
+        );
     }
     match failed.first() {
         None => Ok(()),

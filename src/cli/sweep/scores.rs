@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
-use crate::base::output::write_whole;
+use crate::base::output::{own_file, write_whole};
 use crate::cli::driver;
 use crate::gpu::Gpu;
 use crate::networks::lpips::{Lpips, Range};
@@ -35,7 +35,7 @@ pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range)
         evaluation.add_lpips(&mut metrics);
         let text = serde_json::to_string_pretty(&metrics)
             .map_err(|error| Error::output(run.join(FILE), error.to_string()))?;
-        write_whole(&run.join(FILE), text.as_bytes())?;
+        write_whole(&own_file(run.join(FILE))?, text.as_bytes())?;
     }
     Ok(())
 }

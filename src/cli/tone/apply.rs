@@ -4,7 +4,6 @@ mod page;
 mod photographs;
 
 use std::collections::BTreeMap;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -13,7 +12,7 @@ use self::page::TonePage;
 use self::photographs::{InputPhotograph, listed};
 use crate::base::output::{check_writable, create_folder, printable};
 use crate::cli::settings::{CurveOptions, Selection, SettingOptions};
-use crate::cli::{OutputFormat, driver, finish, progress_bar, table, word, words};
+use crate::cli::{OutputFormat, driver, finish, print, progress_bar, table, word, words};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
 use crate::photographs::findings::findings;
@@ -194,9 +193,9 @@ impl Measures {
 pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
     let output = apply(args)?;
     if args.json {
-        return Ok(writeln!(std::io::stdout(), "{}", serde_json::to_string_pretty(&output)?)?);
+        return Ok(print(serde_json::to_string_pretty(&output)?)?);
     }
-    write!(std::io::stdout(), "{}", text_table(&output))?;
+    print(text_table(&output))?;
     let images =
         args.out.as_ref().map(|out| format!("{} images to {}", output.views.len(), out.display()));
     let wrote: Vec<String> = images
@@ -209,7 +208,8 @@ pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
         }
         false => format!("nightsplat pose {} --out scene", word(&args.input)),
     };
-    finish(&wrote.join(", "), &next)
+    finish(&wrote.join(", "), &next);
+    Ok(())
 }
 
 fn text_table(output: &ToneOutput) -> String {

@@ -1,6 +1,5 @@
 //! `nightsplat tone fit`: fits a tone curve to pairs of photographs.
 
-use std::io::Write;
 use std::path::PathBuf;
 
 use rayon::prelude::*;
@@ -8,7 +7,7 @@ use serde::Serialize;
 
 use crate::base::output::{check_writable, write_whole};
 use crate::cli::table::aligned;
-use crate::cli::{finish, word};
+use crate::cli::{finish, print, word};
 use crate::photographs::fit::{
     Channels, CurveFit, CurveScores, Estimate, FitOptions, FitScene, HeldOut, Pair, Weighting,
     cross_validate, fit,
@@ -155,14 +154,17 @@ pub fn run(args: &FitArgs) -> anyhow::Result<()> {
         let fitted = apply(args)?;
         if args.json { serde_json::to_string_pretty(&fitted)? } else { text(&fitted) }
     };
-    writeln!(std::io::stdout(), "{}", text.trim_end())?;
+    print(text.trim_end())?;
     let option = if args.profile { "profile" } else { "curve" };
     let next = match &args.out {
         Some(out) => format!("nightsplat train photos --out run --{option} {}", word(out)),
         None => format!("the same with --out {option}.toml, for --{option} of train"),
     };
     let wrote = args.out.iter().chain(&args.plot).map(|path| path.display().to_string());
-    if args.json { Ok(()) } else { finish(&wrote.collect::<Vec<_>>().join(", "), &next) }
+    if !args.json {
+        finish(&wrote.collect::<Vec<_>>().join(", "), &next);
+    }
+    Ok(())
 }
 
 /// Refuses --normal with several folders of dark photographs.

@@ -1,10 +1,9 @@
 //! `nightsplat tone list`: the tone curves, their values and plots.
 
-use std::io::Write;
 use std::path::PathBuf;
 
 use crate::base::output::write_whole;
-use crate::cli::{finish, table, words};
+use crate::cli::{finish, print, table, words};
 use crate::photographs::dataset::{Dataset, LoadOptions, Split};
 use crate::photographs::image::{ColourCounts, Image};
 use crate::photographs::tone::{
@@ -54,8 +53,9 @@ struct NamedCurve {
 
 /// Lists, prints or plots.
 pub fn run(args: &ListArgs) -> anyhow::Result<()> {
-    write!(std::io::stdout(), "{}", text(args)?)?;
-    finish("", "nightsplat tone apply photos --curve NAME --out toned")
+    print(text(args)?)?;
+    finish("", "nightsplat tone apply photos --curve NAME --out toned");
+    Ok(())
 }
 
 /// Writes the plot and returns what the command prints.

@@ -61,6 +61,10 @@ pub(super) fn recover(run: &Path) -> Result<()> {
 /// Moves the backup back, over files that have begun in its place.
 fn restore(run: &Path) -> std::io::Result<()> {
     let backup = run.join(BACKUP);
+    if backup.is_symlink() {
+        // What it leads to is no backup of ours.
+        return std::fs::remove_file(backup);
+    }
     if !backup.is_dir() {
         return Ok(());
     }
@@ -110,6 +114,16 @@ mod tests {
             std::fs::write(folder.path().join(name), format!("old {name}")).unwrap();
         }
         folder
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_link_in_place_of_the_backup_takes_nothing_from_another_run() {
+        let (folder, other) = (run(), run());
+        let before = content(folder.path());
+        std::os::unix::fs::symlink(other.path(), folder.path().join(BACKUP)).unwrap();
+        recover(folder.path()).unwrap();
+        assert!(content(folder.path()) == before && content(other.path()) == before);
     }
 
     #[test]

@@ -33,7 +33,7 @@ use super::ledger;
 use super::lock::RunLock;
 pub use super::progress::Progress;
 use super::tensorboard::EventFile;
-use crate::base::output::{csv_field, write_whole};
+use crate::base::output::{csv_field, flush_to_disk, own_file, write_whole};
 use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::loss::exposure::{Affine, table};
@@ -155,8 +155,9 @@ impl RunDirectory {
         lock: RunLock,
     ) -> Result<Self> {
         let recorded = config.clone().with_absolute_paths();
-        write_whole(&path.join("config.toml"), recorded.to_toml()?.as_bytes())?;
-        let log_path = path.join(LOG);
+        let config_path = own_file(path.join("config.toml"))?;
+        write_whole(&config_path, recorded.to_toml()?.as_bytes())?;
+        let log_path = own_file(path.join(LOG))?;
         write_whole(&log_path, log.as_bytes())?;
         let file = File::options().append(true).open(&log_path);
         let file = BufWriter::new(file.map_err(|error| unwritable(&log_path, &error))?);
@@ -169,7 +170,7 @@ impl RunDirectory {
     pub fn save_held_out(&self, scores: &[(u64, f64)]) -> Result<()> {
         let lines = scores.iter().map(|(step, psnr)| format!("{step},{psnr}\n"));
         let text = "step,psnr\n".to_owned() + &lines.collect::<String>();
-        write_whole(&self.path.join(HELD_OUT), text.as_bytes())
+        write_whole(&self.own_file(HELD_OUT)?, text.as_bytes())
     }
 
     /// The intermediate scores up to a step.
@@ -183,7 +184,7 @@ impl RunDirectory {
     pub(super) fn save_progress(&self, progress: &[Progress]) -> Result<()> {
         let lines: String = progress.iter().map(Progress::line).collect();
         let text = format!("{}\n{lines}", Progress::COLUMNS);
-        write_whole(&self.path.join(PROGRESS), text.as_bytes())
+        write_whole(&self.own_file(PROGRESS)?, text.as_bytes())
     }
 
     /// Writes the configuration with the origin of each value.
@@ -195,19 +196,19 @@ impl RunDirectory {
     ) -> Result<()> {
         let text = settings.written(&config.clone().with_absolute_paths())?;
         let text = format!("# trained with {}\n{text}", trained_with(gpu));
-        write_whole(&self.path.join("config.toml"), text.as_bytes())
+        write_whole(&self.own_file("config.toml")?, text.as_bytes())
     }
 
     /// Writes the plan that the configuration follows.
     pub fn save_plan(&self, plan: &Plan) -> Result<()> {
-        write_whole(&self.path.join(PLAN), plan.to_toml()?.as_bytes())
+        write_whole(&self.own_file(PLAN)?, plan.to_toml()?.as_bytes())
     }
 
     /// Writes the list of views, to detect that a dataset has changed.
     pub fn save_views(&self, dataset: &Dataset) -> Result<()> {
         let lines: String = view_lines(dataset).into_iter().map(|line| line + "\n").collect();
         let text = format!("name,split,width,height\n{lines}");
-        write_whole(&self.path.join(VIEWS), text.as_bytes())
+        write_whole(&self.own_file(VIEWS)?, text.as_bytes())
     }
 
     /// Creates event files for `TensorBoard`, for steps after `step`.
@@ -220,11 +221,12 @@ impl RunDirectory {
         self.seconds_before
     }
 
-    /// Flushes the log, then writes a checkpoint and the model. The previous checkpoint is kept, the only one until
-    /// this is complete.
+    /// Flushes to the disk what resuming needs besides the checkpoint, then writes that and the model. The previous
+    /// checkpoint is kept, the only one until this is complete.
     pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
         let _phase = tracing::info_span!("files").entered();
-        self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
+        self.flush_log()?;
+        flush_to_disk(&self.path, &["config.toml", PLAN, LOG])?;
         let newest = generations::rotate(&self.path)?;
         trainer.save_checkpoint(&newest)?;
         self.save_trained(trainer)
@@ -239,7 +241,7 @@ impl RunDirectory {
         }
         if let Some(lamp) = trainer.lamp()? {
             let text = serde_json::json!(lamp);
-            write_whole(&self.path.join(LAMP), format!("{text:#}\n").as_bytes())?;
+            write_whole(&self.own_file(LAMP)?, format!("{text:#}\n").as_bytes())?;
         }
         match trainer.exposures()? {
             Some(exposures) => self.save_exposures(&exposures),
@@ -254,7 +256,7 @@ impl RunDirectory {
 
     /// Appends the checksum of every parameter plane to `hashes.csv`.
     pub(super) fn log_hashes(&self, step: u64, gaussians: &Gaussians) -> Result<()> {
-        let path = self.path.join(HASHES);
+        let path = self.own_file(HASHES)?;
         let recorded = std::fs::read_to_string(&path).unwrap_or_default();
         let text = ledger::extended(&recorded, step, gaussians);
         write_whole(&path, text.as_bytes())
@@ -269,6 +271,11 @@ impl RunDirectory {
         self.log_line(&format!("{step},{view},{loss:.6},{terms}{gaussians},{milliseconds:.2}"))
     }
 
+    /// The path of a file of the run, free of links.
+    fn own_file(&self, file: &str) -> Result<PathBuf> {
+        own_file(self.path.join(file))
+    }
+
     /// Flushes the log for other readers.
     pub fn flush_log(&mut self) -> Result<()> {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))
@@ -281,22 +288,22 @@ impl RunDirectory {
         trainer.refuse_not_finite(&in_frame)?;
         let model = trainer.model_of(&in_frame);
         let comments = model.facts().comments();
-        ply::save_with_comments(&model.shown(), self.path.join("model.ply"), &comments)
+        ply::save_with_comments(&model.shown(), self.own_file("model.ply")?, &comments)
     }
 
     /// Writes the weights of the networks.
     pub fn save_networks(&self, networks: &Networks) -> Result<()> {
-        networks.save(&self.path.join(NETWORKS))
+        networks.save(&self.own_file(NETWORKS)?)
     }
 
     /// Writes the exposures of the training views.
     pub fn save_exposures(&self, exposures: &[(String, Affine)]) -> Result<()> {
-        table::save(&self.path.join(EXPOSURES), exposures)
+        table::save(&self.own_file(EXPOSURES)?, exposures)
     }
 
     /// Writes `metrics.json`, which marks a complete run.
     pub fn save_metrics(&self, metrics: &serde_json::Value) -> Result<()> {
-        write_whole(&self.path.join("metrics.json"), format!("{metrics:#}\n").as_bytes())
+        write_whole(&self.own_file("metrics.json")?, format!("{metrics:#}\n").as_bytes())
     }
 
     fn log_line(&mut self, line: &str) -> Result<()> {

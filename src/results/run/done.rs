@@ -5,8 +5,8 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::files::{DONE, trained_with};
-use crate::base::output::write_whole;
+use super::files::{DONE, FILES, trained_with};
+use crate::base::output::{flush_to_disk, own_file, write_whole};
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, Fingerprint};
 use crate::train::{Ended, TrainConfig};
@@ -29,7 +29,7 @@ struct Done {
     trained_with: serde_json::Value,
 }
 
-/// Writes the file, after all others.
+/// Writes the file, once all others are on the disk.
 pub(super) fn save(
     run: &Path,
     config: &TrainConfig,
@@ -48,7 +48,9 @@ pub(super) fn save(
     };
     let text =
         serde_json::to_string_pretty(&done).map_err(|error| Error::Usage(error.to_string()))?;
-    write_whole(&run.join(DONE), (text + "\n").as_bytes())
+    flush_to_disk(run, &FILES)?;
+    write_whole(&own_file(run.join(DONE))?, (text + "\n").as_bytes())?;
+    flush_to_disk(run, &[DONE])
 }
 
 /// The file, if it exists and those of the run do.

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::files::{CHECKPOINT, CHECKPOINT_BEFORE, unwritable};
 use crate::Result;
+use crate::base::output::own_file;
 use crate::train::check_checkpoint;
 
 fn both(run: &Path) -> [PathBuf; 2] {
@@ -43,5 +44,5 @@ pub(super) fn rotate(run: &Path) -> Result<PathBuf> {
     if newest.exists() {
         std::fs::rename(&newest, before).map_err(|error| unwritable(&newest, &error))?;
     }
-    Ok(newest)
+    own_file(newest)
 }

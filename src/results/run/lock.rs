@@ -26,6 +26,7 @@ impl RunLock {
             Error::output(run, format!("cannot be locked ({error}); check the folder and the disk"))
         };
         loop {
+            refuse_other(run, &path)?;
             let options =
                 File::options().read(true).write(true).create(true).truncate(false).clone();
             let mut file = options.open(&path).map_err(unusable)?;
@@ -48,6 +49,7 @@ impl RunLock {
     /// Checks that [`RunLock::take`] would succeed.
     pub(super) fn check(run: &Path) -> Result<()> {
         let path = run.join(LOCK);
+        refuse_other(run, &path)?;
         match File::open(&path).map(|file| file.try_lock_shared()) {
             Ok(Err(TryLockError::WouldBlock)) => Err(taken(run, &path)),
             _ => Ok(()),
@@ -59,6 +61,16 @@ impl Drop for RunLock {
     fn drop(&mut self) {
         // After the removal no other process opens the file, and the lock ends with it.
         let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+/// Refuses what is no file: opening a pipe waits, and a link leads to somebody's file.
+fn refuse_other(run: &Path, path: &Path) -> Result<()> {
+    match path.symlink_metadata() {
+        Ok(there) if !there.is_file() => {
+            Err(Error::output(run, format!("has {LOCK}, which is no file; remove it")))
+        }
+        _ => Ok(()),
     }
 }
 
@@ -111,5 +123,24 @@ mod tests {
         // The file of a killed process is no lock.
         std::fs::write(folder.path().join(LOCK), "1\n").unwrap();
         drop(RunLock::take(folder.path()).unwrap());
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_pipe_or_a_link_in_place_of_the_lock_is_refused_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let (run, file) = (folder.path().join("run"), folder.path().join("file"));
+        std::fs::write(&file, "precious").unwrap();
+        for words in [vec!["mkfifo"], vec!["ln", "-s", file.to_str().unwrap()]] {
+            std::fs::create_dir(&run).unwrap();
+            let mut plant = std::process::Command::new(words[0]);
+            assert!(plant.args(&words[1..]).arg(run.join(LOCK)).status().unwrap().success());
+            for refused in [RunLock::take(&run).map(drop), RunLock::check(&run)] {
+                let message = refused.unwrap_err().to_string();
+                assert!(message.contains("has .lock, which is no file"), "{message}");
+            }
+            std::fs::remove_dir_all(&run).unwrap();
+        }
+        assert_eq!(std::fs::read(file).unwrap(), b"precious");
     }
 }

@@ -8,14 +8,12 @@ use crate::Stop;
 /// Requests that a run fulfils after the steps under way. Clones share their state.
 #[derive(Clone, Debug, Default)]
 pub struct Requests {
-    /// 0, or 1 + the index in [`STOPS`].
+    /// 0, or 1 + the index in [`Stop::ALL`].
     stop: Arc<AtomicUsize>,
     save: Arc<AtomicBool>,
     pause: Arc<AtomicBool>,
     snapshot: Arc<AtomicBool>,
 }
-
-const STOPS: [Stop; 3] = [Stop::Interrupted, Stop::Terminated, Stop::TimeUp];
 
 impl Requests {
     /// Requests to save and stop.
@@ -55,7 +53,7 @@ impl Requests {
     /// The cause of a request to stop, if there is one.
     pub(crate) fn stops(&self) -> Option<Stop> {
         let index = self.stop.load(Ordering::Relaxed).checked_sub(1)?;
-        STOPS.get(index).copied()
+        Stop::ALL.get(index).copied()
     }
 
     /// Whether a save was requested since the last call.
@@ -70,7 +68,7 @@ impl Requests {
 
     /// The number of a cause in [`Requests::stop_flag`].
     pub(crate) fn code(cause: Stop) -> usize {
-        STOPS.iter().position(|&stop| stop == cause).map_or(0, |index| index + 1)
+        Stop::ALL.iter().position(|&stop| stop == cause).map_or(0, |index| index + 1)
     }
 
     /// The flag of [`Requests::save`], for signal handlers.
@@ -87,7 +85,7 @@ mod tests {
     fn every_cause_arrives_and_a_save_is_done_once() {
         let requests = Requests::default();
         assert_eq!((requests.stops(), requests.takes_save()), (None, false));
-        for cause in STOPS {
+        for cause in Stop::ALL {
             requests.clone().stop(cause);
             assert_eq!(requests.stops(), Some(cause));
         }
