@@ -2,6 +2,8 @@
 //! to the photograph, and the photograph's alpha.
 
 use std::path::Path;
+#[cfg(feature = "cli")]
+use std::path::PathBuf;
 
 use super::listed::ViewEntry;
 use crate::photographs::image::MaskFile;
@@ -31,6 +33,16 @@ fn moving(frame: &ViewEntry, files: &PhotographFiles) -> Option<MaskFile> {
     let name = file.file_name()?.to_str()?;
     let path = files.find(file.parent()?, &format!("{MOVING}{name}"))?;
     Some(MaskFile { path, is_inverted: true })
+}
+
+/// The mask beside a photograph that no listing names.
+#[cfg(feature = "cli")]
+pub(crate) fn beside(photograph: &Path, files: &PhotographFiles) -> Option<PathBuf> {
+    let name = photograph.file_name()?.to_str()?;
+    let folder = photograph.with_file_name(FOLDER);
+    let named = [name.to_owned(), format!("{name}.png")].map(|name| files.find(&folder, &name));
+    let moving = || files.find(photograph.parent()?, &format!("{MOVING}{name}"));
+    named.into_iter().flatten().next().or_else(moving)
 }
 
 /// Whether a file is a mask in a folder of photographs.

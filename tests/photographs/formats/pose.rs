@@ -28,6 +28,7 @@ pub(super) fn stub(folder: &Path, cases: &str) -> PathBuf {
          --image_path) images=$2;;\n\
          --output_path) output=$2;;\n\
          --image_list_path) list=$2;;\n\
+         --ImageReader.mask_path) masks=$2;;\n\
          --Mapper.init_min_tri_angle) angle=$2;;\n\
          esac\n\
          shift\n\
