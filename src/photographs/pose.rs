@@ -177,8 +177,8 @@ fn possible_lenses(model: &Path, photos: &Path) -> Result<Vec<Lens>> {
     let impossible: Vec<(usize, String)> = lenses.iter().filter_map(of_lens).collect();
     if 2 * impossible.iter().map(|(photographs, _)| photographs).sum::<usize>() > taken {
         let problem = format!(
-            "COLMAP's calibration cannot be, {}; take more photographs, closer together, mask what moves with the camera \
-             before, or try --camera-model SIMPLE_RADIAL, which has one focal length",
+            "COLMAP's calibration cannot be, {}; mask what moves with the camera (masks/ beside the photographs), take \
+             more of them, closer together, or try --camera-model SIMPLE_RADIAL, which has one focal length",
             impossible[0].1
         );
         return Err(Error::input(photos, problem));

@@ -115,6 +115,7 @@ fn what_is_burnt_in_has_no_features_and_is_masked_in_the_dataset() {
         picture.save_png8(photos.join(format!("v{index:02}.png"))).unwrap();
     }
     photograph(&photos.join("masks/v03.png"), SIZE, 1.0);
+    photograph(&photos.join("masks/v04.png"), SIZE, 0.0);
     model(9).write_binary(&root.join("models/0"));
     let cases = format!("feature_extractor) cp -r $masks {};;\n{}", seen.display(), models(root));
     let (_, stderr) = run(&line(&photos, &out, &stub(root, &cases), ""), 0);
@@ -126,10 +127,13 @@ fn what_is_burnt_in_has_no_features_and_is_masked_in_the_dataset() {
         assert!(pixels().all(|(x, y)| !is_text(x, y) || !shown(&mask, x, y)), "{mask:?}");
         assert!(pixels().all(|(x, y)| y > 20 || shown(&mask, x, y)), "{mask:?}");
     }
+    // Masks of the photographs count for both, and stay as they are in the dataset.
+    assert!(!shown(&seen.join("v04.png.png"), 0, 0));
+    assert!(shown(&out.join("masks/v03.png"), 5, 25));
     let dataset = load(&out);
-    // A mask of its own stays as it is.
-    let masked: Vec<bool> = dataset.views.iter().map(|view| view.mask.is_some()).collect();
-    assert_eq!(masked, (0..9).map(|index| index != 3).collect::<Vec<_>>());
+    let masked = dataset.views.iter().filter(|view| view.mask.is_some());
+    let masked: Vec<&str> = masked.map(|view| view.name.as_str()).collect();
+    assert_eq!(masked, ["v00", "v01", "v02", "v05", "v06", "v07", "v08"]);
 }
 
 #[test]
