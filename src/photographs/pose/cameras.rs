@@ -25,7 +25,7 @@ pub fn describe(lens: &Lens) -> String {
     format!("{}x{} with focal length {focal}", lens.width, lens.height)
 }
 
-/// The reason why there is no lens with this calibration: whoever has it has no poses.
+/// The reason why there is no lens with this calibration: the poses found with it are wrong, too.
 pub(super) fn impossible(lens: &Lens) -> Option<String> {
     /// Ratio of the focal lengths. The most that anamorphic lenses have is 2.
     const MAX_ASPECT: f64 = 2.5;

@@ -1,5 +1,5 @@
-//! What stays in place in photographs that move, such as a date burnt into them: COLMAP would take its features for those
-//! of a scene at rest.
+//! What stays in place in photographs that move, such as a date burnt into them: COLMAP would take its features for
+//! those of a scene at rest.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -12,8 +12,8 @@ use crate::photographs::dataset::{Borders, LoadOptions, mask_beside};
 use crate::photographs::image::files::PhotographFiles;
 use crate::photographs::image::{Image, Mask};
 
-/// Writes for COLMAP what is masked of each photograph: what stays in place, of which it says how much that is, and what
-/// a mask beside the photograph hides.
+/// Writes for COLMAP what is masked of each photograph: what stays in place, and what a mask beside the photograph
+/// hides. Says how much stays in place.
 ///
 /// # Errors
 /// A mask that cannot be read or has another aspect ratio than its photograph.
@@ -24,9 +24,9 @@ pub(super) fn mask(pictures: &PosePhotographs) -> Result<()> {
         let mut written: BTreeMap<(u32, u32), PathBuf> = BTreeMap::new();
         for photograph in photographs {
             let (size, to) = (Image::size_of(photograph)?, pictures.mask(photograph));
-            if let Some(own) = mask_beside(photograph, &files) {
-                let own = Mask::load(photograph, Some(&own.path), own.is_inverted)?;
-                write(found.hide_borders(own, size), &to)?;
+            if let Some(beside) = mask_beside(photograph, &files) {
+                let mask = Mask::load(photograph, Some(&beside.path), beside.is_inverted)?;
+                write(found.hide_borders(mask, size), &to)?;
             } else if let Some(same) = written.get(&size) {
                 link_or_copy_to(same, &to)?;
             } else if let Some(mask) = found.hide_borders(None, size) {
