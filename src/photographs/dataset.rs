@@ -56,6 +56,8 @@ pub use fingerprint::Fingerprint;
 use layout::DatasetLayout;
 use listed::{Listing, ViewEntry};
 use listing::{select, warn};
+#[cfg(feature = "cli")]
+pub(crate) use masks::beside as mask_beside;
 pub(crate) use masks::is_beside as is_mask;
 use members::with_held_out;
 pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
@@ -234,10 +236,13 @@ impl Dataset {
         colmap::images_renamed(images, renamed)
     }
 
-    /// The calibrated lenses of a COLMAP model.
+    /// The lenses of a COLMAP model, each with how many photographs it took.
     #[cfg(feature = "cli")]
-    pub(crate) fn lenses(model: &Path) -> Result<Vec<Lens>> {
-        Ok(colmap::read_cameras(model)?.into_values().collect())
+    pub(crate) fn lenses(model: &Path) -> Result<Vec<(Lens, usize)>> {
+        let images = colmap::read_images(model)?;
+        let taken = |id| images.iter().filter(|image| image.camera == id).count();
+        let lenses = colmap::read_cameras(model)?;
+        Ok(lenses.into_iter().map(|(id, lens)| (lens, taken(id))).collect())
     }
 
     /// The folder with the contents of an archive: its only folder, if there is nothing else.

@@ -5,6 +5,7 @@
 
 mod cameras;
 mod clip;
+mod in_place;
 mod pictures;
 mod reconstruction;
 mod stages;
@@ -122,8 +123,10 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(PoseProgress<'_>)) -> Res
         distinct_photographs(&folder)?
     };
     let gpu = (options.open)(&options.device)?;
-    let mut pictures = PosePhotographs { dark, bright, copies: out.work.join("tone-mapped") };
+    let [copies, masks] = ["tone-mapped", "masks"].map(|name| out.work.join(name));
+    let mut pictures = PosePhotographs { dark, bright, copies, masks };
     brighten(&gpu, &mut pictures, options.light, report)?;
+    in_place::mask(&pictures)?;
     let all = pictures.dark.len();
     let models = reconstruction.models(&pictures, report)?;
     let largest = Dataset::largest_model(&models, is_dark)?;
@@ -138,17 +141,19 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(PoseProgress<'_>)) -> Res
         );
         Error::input(&options.photos, problem)
     })?;
+    let lenses = possible_lenses(&model, &options.photos)?;
     let bright: Vec<String> = names.iter().filter_map(|name| bright_name(name)).collect();
     let dark: Vec<String> = names.into_iter().filter(|name| is_dark(name)).collect();
     out.add_photographs("", &pictures.dark, &dark)?;
     out.add_masks(&folder, is_clip)?;
+    out.add_masks_in_place("", &pictures, &pictures.dark, &dark)?;
     let own_name = |name: &str| is_dark(name).then(|| name.to_owned());
-    let sparse = out.add_model("", &model, options.with.as_ref().map(|_| own_name))?;
+    out.add_model("", &model, options.with.as_ref().map(|_| own_name))?;
     if !bright.is_empty() {
         out.add_photographs(BRIGHT, &pictures.bright, &bright)?;
+        out.add_masks_in_place(BRIGHT, &pictures, &pictures.bright, &bright)?;
         out.add_model(BRIGHT, &model, Some(bright_name))?;
     }
-    let lenses = Dataset::lenses(&sparse)?;
     out.finish()?;
     let placed = dark.len();
     let target = options.out.display();
@@ -156,6 +161,29 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(PoseProgress<'_>)) -> Res
     warn_of(&lenses, &pictures.dark, &dark);
     let bright = options.with.as_ref().map(|_| [bright.len(), pictures.bright.len()]);
     Ok(Posed { photographs: all, placed, bright, lenses })
+}
+
+/// The lenses of a model.
+///
+/// # Errors
+/// Those of most of its photographs cannot be.
+fn possible_lenses(model: &Path, photos: &Path) -> Result<Vec<Lens>> {
+    let lenses = Dataset::lenses(model)?;
+    let taken: usize = lenses.iter().map(|(_, photographs)| photographs).sum();
+    let of_lens = |(lens, photographs): &(Lens, usize)| {
+        cameras::impossible(lens)
+            .map(|problem| (*photographs, format!("{}: {problem}", describe(lens))))
+    };
+    let impossible: Vec<(usize, String)> = lenses.iter().filter_map(of_lens).collect();
+    if 2 * impossible.iter().map(|(photographs, _)| photographs).sum::<usize>() > taken {
+        let problem = format!(
+            "COLMAP's calibration cannot be, {}; mask what moves with the camera (masks/ beside the photographs), take \
+             more of them, closer together, or try --camera-model SIMPLE_RADIAL, which has one focal length",
+            impossible[0].1
+        );
+        return Err(Error::input(photos, problem));
+    }
+    Ok(lenses.into_iter().map(|(lens, _)| lens).collect())
 }
 
 /// The pairs that are matched.
@@ -179,7 +207,7 @@ fn brighten(
     light: Option<StoredLight>,
     report: &dyn Fn(PoseProgress<'_>),
 ) -> Result<()> {
-    let PosePhotographs { dark, bright, copies } = pictures;
+    let PosePhotographs { dark, bright, copies, .. } = pictures;
     let gain = tone_mapped::write(gpu, dark, light, copies, report)?;
     let count = dark.len();
     report(PoseProgress::Line(&format!("{count} photographs brightened (gain {gain:.1})")));

@@ -8,6 +8,7 @@ mod overlay;
 
 use std::cell::OnceCell;
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use super::source::{ViewFiles, shown};
 use super::{LoadOptions, Photograph, Split};
@@ -60,23 +61,42 @@ impl Borders {
             let picture = Box::new(|| source.picture());
             BorderCandidate { size: size.unwrap_or_default(), picture }
         });
-        Self::find(candidates, options)
+        Self::find(candidates, options, &warn)
     }
 
     /// Those of a dataset that is not loaded.
     pub(crate) fn of_photographs(photographs: &[Photograph], options: &LoadOptions) -> Self {
         let training =
             photographs.iter().filter(|one| one.split == Split::Train && one.mask.is_none());
-        let candidates = training.map(|Photograph { input, .. }| {
-            let picture = Box::new(|| shown(PictureFile::open(input).ok()?));
-            BorderCandidate { size: Image::size_of(input).unwrap_or_default(), picture }
-        });
-        Self::find(candidates, options)
+        let candidates = training.map(|one| BorderCandidate::of_file(&one.input));
+        Self::find(candidates, options, &warn)
+    }
+
+    /// Those of files, unsaid.
+    #[cfg(feature = "cli")]
+    pub(crate) fn of_files<'a>(
+        files: impl Iterator<Item = &'a Path>,
+        options: &LoadOptions,
+    ) -> Self {
+        Self::find(files.map(BorderCandidate::of_file), options, &drop)
+    }
+
+    /// The pixels of both.
+    #[cfg(feature = "cli")]
+    pub(crate) fn joined(mut self, other: Self) -> Self {
+        for (size, pixels) in other.0 {
+            let hidden = self.0.entry(size).or_default();
+            hidden.extend(pixels);
+            hidden.sort_unstable();
+            hidden.dedup();
+        }
+        self
     }
 
     fn find<'a>(
         candidates: impl Iterator<Item = BorderCandidate<'a>>,
         options: &LoadOptions,
+        say: &dyn Fn(String),
     ) -> Self {
         let mut by_size: BTreeMap<(u32, u32), Vec<BorderCandidate<'_>>> = BTreeMap::new();
         if options.mask_borders || options.mask_overlays {
@@ -84,7 +104,7 @@ impl Borders {
         }
         by_size.retain(|_, candidates| candidates.len() >= NEEDED);
         let found = by_size.into_iter().filter_map(|(size, candidates)| {
-            let hidden = hidden(&candidates, size, options);
+            let hidden = hidden(&candidates, size, options, say);
             (!hidden.is_empty()).then_some((size, hidden))
         });
         Self(found.collect())
@@ -96,11 +116,23 @@ impl Borders {
     }
 }
 
+impl<'a> BorderCandidate<'a> {
+    fn of_file(file: &'a Path) -> Self {
+        let picture = Box::new(|| shown(PictureFile::open(file).ok()?));
+        Self { size: Image::size_of(file).unwrap_or_default(), picture }
+    }
+}
+
+fn warn(line: String) {
+    tracing::warn!("{line}");
+}
+
 /// The pixels outside the scene in photographs of one size. Says what they are.
 fn hidden(
     candidates: &[BorderCandidate<'_>],
     (width, height): (u32, u32),
     options: &LoadOptions,
+    say: &dyn Fn(String),
 ) -> Vec<usize> {
     let grid = PixelGrid { width: width as usize, height: height as usize };
     let step = candidates.len().div_ceil(LOOKED_AT);
@@ -117,16 +149,16 @@ fn hidden(
     if options.mask_borders
         && let Some(border) = border((0..chosen.len()).filter_map(plane), (width, height))
     {
-        tracing::warn!(
+        say(format!(
             "{:.1} % of the photographs of {width}x{height} is black in the same place at the border, as \
              undistorting leaves it where the lens saw nothing: masked (mask_borders = false trains on it)",
             100.0 * border.len() as f64 / grid.len() as f64
-        );
+        ));
         hidden = border;
     }
     if options.mask_overlays {
         for Overlay { rows, columns, .. } in overlay::overlays(chosen.len(), plane, &grid) {
-            tracing::warn!(
+            say(format!(
                 "rows {} to {}, columns {} to {} of the photographs of {width}x{height} hardly change between views \
                  that move, like a date burnt into them: masked (masks/ can mask other pixels, mask_overlays = false \
                  trains on these)",
@@ -134,7 +166,7 @@ fn hidden(
                 rows.end - 1,
                 columns.start,
                 columns.end - 1
-            );
+            ));
             hidden.extend(rows.flat_map(|y| columns.clone().map(move |x| y * grid.width + x)));
         }
     }

@@ -22,15 +22,24 @@ pub(super) fn find(root: &Path, frame: &ViewEntry, files: &PhotographFiles) -> O
     let names = [frame.below.clone(), frame.below.clone() + ".png"];
     let of_file = file.map(|file| format!("{file}.png"));
     let file = names.into_iter().chain(of_file).find_map(|name| files.find(&folder, &name));
-    file.map(MaskFile::shown).or_else(|| moving(frame, files))
+    file.map(MaskFile::shown).or_else(|| moving(frame.file.as_ref()?, files))
 }
 
 /// The mask of moving objects.
-fn moving(frame: &ViewEntry, files: &PhotographFiles) -> Option<MaskFile> {
-    let file = frame.file.as_ref()?;
-    let name = file.file_name()?.to_str()?;
-    let path = files.find(file.parent()?, &format!("{MOVING}{name}"))?;
+fn moving(photograph: &Path, files: &PhotographFiles) -> Option<MaskFile> {
+    let name = photograph.file_name()?.to_str()?;
+    let path = files.find(photograph.parent()?, &format!("{MOVING}{name}"))?;
     Some(MaskFile { path, is_inverted: true })
+}
+
+/// The mask beside a photograph that no listing names.
+#[cfg(feature = "cli")]
+pub(crate) fn beside(photograph: &Path, files: &PhotographFiles) -> Option<MaskFile> {
+    let name = photograph.file_name()?.to_str()?;
+    let folder = photograph.with_file_name(FOLDER);
+    let named = [name.to_owned(), format!("{name}.png")].map(|name| files.find(&folder, &name));
+    let named = named.into_iter().flatten().next().map(MaskFile::shown);
+    named.or_else(|| moving(photograph, files))
 }
 
 /// Whether a file is a mask in a folder of photographs.

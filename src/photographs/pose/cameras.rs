@@ -25,12 +25,38 @@ pub fn describe(lens: &Lens) -> String {
     format!("{}x{} with focal length {focal}", lens.width, lens.height)
 }
 
+/// The reason why there is no lens with this calibration: the poses found with it are wrong, too.
+pub(super) fn impossible(lens: &Lens) -> Option<String> {
+    /// Ratio of the focal lengths. The most that anamorphic lenses have is 2.
+    const MAX_ASPECT: f64 = 2.5;
+    /// The larger field of view of both axes, degrees; a fisheye has any.
+    const FIELD: [f64; 2] = [5.0, 170.0];
+    let aspect = lens.focal.max_element() / lens.focal.min_element();
+    if aspect > MAX_ASPECT {
+        return Some(format!(
+            "one of its focal lengths is {aspect:.1} times the other ({MAX_ASPECT} at most)"
+        ));
+    }
+    let size = DVec2::new(lens.width.into(), lens.height.into());
+    let half = (0.5 * size / lens.focal).max_element();
+    let angle = if lens.distortion.is_fisheye { half } else { half.atan() };
+    let field = 2.0 * angle.to_degrees();
+    let [least, most] = FIELD;
+    let is_possible = field >= least && (field <= most || lens.distortion.is_fisheye);
+    (!is_possible).then(|| {
+        format!("its field of view is {field:.1} degrees ({least} at least, {most} at most)")
+    })
+}
+
 /// The reason why no real lens has this calibration; `None` if it is plausible.
 pub(super) fn implausible(lens: &Lens) -> Option<String> {
     /// Ratio of the focal lengths. Pixels are square; an anamorphic lens has 1.33.
     const MAX_ASPECT: f64 = 1.2;
     /// Displacement of a corner, relative to its distance from the principal point.
     const MAX_DISTORTION: f64 = 0.6;
+    if let Some(problem) = impossible(lens) {
+        return Some(problem);
+    }
     let aspect = lens.focal.max_element() / lens.focal.min_element();
     if aspect > MAX_ASPECT {
         return Some(format!("its focal lengths are {:.0} % apart", 100.0 * (aspect - 1.0)));
@@ -77,6 +103,21 @@ mod tests {
         };
         assert_eq!(implausible(&lens([520.0, 521.0], -0.02, 0.03)), None);
         assert_eq!(implausible(&lens([300.0, 300.0], -0.3, 0.08)), None, "an action camera");
+        assert_eq!(impossible(&lens([964.0, 686.0], 0.0, 0.0)), None, "implausible alone");
+        assert_eq!(impossible(&lens([22.0, 22.0], 0.0, 0.0)), None, "170 degrees");
+        for (focal, part) in [
+            ([3723.0, 309.0], "12.0 times the other (2.5 at most)"),
+            ([6000.0, 6000.0], "field of view is 4.8 degrees (5 at least"),
+            ([20.0, 20.0], "field of view is 170.9 degrees"),
+        ] {
+            let lens = lens(focal, 0.0, 0.0);
+            let problem = impossible(&lens).unwrap();
+            assert!(problem.contains(part), "{problem}");
+            assert_eq!(implausible(&lens), Some(problem));
+        }
+        let distortion = Distortion { is_fisheye: true, ..Distortion::default() };
+        let fisheye = Lens { distortion, ..lens([150.0, 150.0], 0.0, 0.0) };
+        assert_eq!(impossible(&fisheye), None, "a fisheye of 190 degrees");
         for (lens, part) in [
             (lens([964.0, 686.0], 0.0, 0.0), "41 % apart"),
             (lens([300.0, 300.0], -0.9, 0.0), "folds"),

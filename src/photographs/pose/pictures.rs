@@ -13,6 +13,8 @@ pub(super) struct PosePhotographs {
     pub(super) bright: Vec<PathBuf>,
     /// The folder of their tone-mapped copies.
     pub(super) copies: PathBuf,
+    /// The folder of the masks of what stays in place, which have the names of the copies; it may be absent.
+    pub(super) masks: PathBuf,
 }
 
 impl PosePhotographs {
@@ -26,6 +28,16 @@ impl PosePhotographs {
         let name = tone_mapped::name(photograph);
         let is_bright = self.bright.iter().any(|bright| bright == photograph);
         if is_bright { format!("{BRIGHT}/{name}") } else { name }
+    }
+
+    /// The tone-mapped copy of a photograph.
+    pub(super) fn copy(&self, photograph: &Path) -> PathBuf {
+        self.copies.join(self.name(photograph))
+    }
+
+    /// The mask that COLMAP has of a photograph.
+    pub(super) fn mask(&self, photograph: &Path) -> PathBuf {
+        self.masks.join(self.name(photograph) + ".png")
     }
 }
 

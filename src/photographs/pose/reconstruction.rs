@@ -44,6 +44,8 @@ pub(super) struct Reconstruction<'a> {
     /// GLOMAP, if it registers the cameras.
     glomap: Option<Tool<'a>>,
     options: &'a PoseOptions,
+    /// How many, dark and bright.
+    photographs: usize,
     matcher: Matcher,
     /// Whether matching uses the two-view geometry that it found before.
     is_guided: bool,
@@ -115,6 +117,7 @@ impl<'a> Reconstruction<'a> {
             colmap,
             glomap,
             options: settings,
+            photographs: 0,
             matcher,
             is_guided: false,
             relaxed: &[],
@@ -135,7 +138,7 @@ impl<'a> Reconstruction<'a> {
         report: &dyn Fn(PoseProgress<'_>),
     ) -> Result<PathBuf> {
         let copies = pictures.copies.as_path();
-        let everything = pictures.dark.len() + pictures.bright.len();
+        self.photographs = pictures.dark.len() + pictures.bright.len();
         self.extract(pictures, report)?;
         // COLMAP matches no pair twice: matching again begins with the features alone.
         let features = self.work.join("guided.db");
@@ -143,7 +146,7 @@ impl<'a> Reconstruction<'a> {
             std::fs::copy(&self.database, &features)
                 .map_err(|error| Error::output(&features, format!("cannot be written: {error}")))?;
         }
-        self.match_features(everything, report)?;
+        self.match_features(report)?;
         self.register(copies, report)?;
         let all = pictures.dark.len();
         let mut placed = placed_in(&self.models)?;
@@ -156,7 +159,7 @@ impl<'a> Reconstruction<'a> {
         self.is_guided = true;
         self.use_folder("guided")?;
         self.database = features;
-        match self.match_features(everything, report).and_then(|()| self.register(copies, report)) {
+        match self.match_features(report).and_then(|()| self.register(copies, report)) {
             // The models of the first attempt are still there.
             Err(error) if placed > 0 => {
                 tracing::warn!("{error}; using the cameras of the first attempt");
@@ -212,6 +215,9 @@ impl<'a> Reconstruction<'a> {
                 ("ImageReader.camera_model".to_owned(), self.options.camera_model.as_str().into()),
                 (use_gpu.clone(), self.gpu().into()),
             ]);
+            if pictures.masks.is_dir() {
+                options.push(("ImageReader.mask_path".to_owned(), pictures.masks.clone().into()));
+            }
             if runs.len() > 1 {
                 let list = self.work.join(format!("camera{at}.txt"));
                 let names = group.iter().map(|path| pictures.name(path)).collect::<Vec<_>>();
@@ -230,7 +236,7 @@ impl<'a> Reconstruction<'a> {
         Ok(())
     }
 
-    fn match_features(&self, count: usize, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
+    fn match_features(&self, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
         let command = self.matcher.command();
         let of_matching = |option| self.named(command, ["FeatureMatching", "SiftMatching"], option);
         let mut options = vec![("database_path".to_owned(), self.database.clone().into())];
@@ -241,7 +247,7 @@ impl<'a> Reconstruction<'a> {
         }
         if self.matcher == Matcher::Exhaustive {
             // COLMAP reports its progress block by block.
-            let block = (count / 6).clamp(4, 50);
+            let block = (self.photographs / 6).clamp(4, 50);
             options.push(("ExhaustiveMatching.block_size".to_owned(), block.to_string().into()));
         }
         self.run(&self.colmap, command, options, "matching", report)?;
@@ -292,7 +298,7 @@ impl<'a> Reconstruction<'a> {
         let options: Vec<[OsString; 2]> =
             options.into_iter().map(|(name, value)| [format!("--{name}").into(), value]).collect();
         let arguments: Vec<&OsStr> = options.iter().flatten().map(OsString::as_os_str).collect();
-        let mut stage = StageProgress::new(what);
+        let mut stage = StageProgress::new(what, self.photographs);
         tool.run(command, &arguments, |printed| {
             if let Some(line) = stage.due(printed) {
                 report(PoseProgress::Line(&line));

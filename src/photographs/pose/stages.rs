@@ -8,13 +8,14 @@ const INTERVAL: Duration = Duration::from_secs(10);
 /// The progress of a running command, as a line every few seconds.
 pub(super) struct StageProgress<'a> {
     what: &'a str,
+    photographs: usize,
     last: Instant,
 }
 
 impl<'a> StageProgress<'a> {
-    /// Starts a stage; `what` begins its lines.
-    pub(super) fn new(what: &'a str) -> Self {
-        Self { what, last: Instant::now() }
+    /// Starts a stage on this number of photographs; `what` begins its lines.
+    pub(super) fn new(what: &'a str, photographs: usize) -> Self {
+        Self { what, photographs, last: Instant::now() }
     }
 
     /// The next line if it is due, from the output so far.
@@ -23,20 +24,17 @@ impl<'a> StageProgress<'a> {
             return None;
         }
         self.last = Instant::now();
-        let how_far = counted(printed).map_or_else(
-            || "at work".to_owned(),
-            |[at, of]| match of {
-                0 => format!("{at} so far"),
-                _ => format!("{at} of {of}"),
-            },
-        );
+        let how_far = match counted(printed, self.photographs) {
+            Some([at, of]) => format!("{at} of {of}"),
+            None => "at work".to_owned(),
+        };
         Some(format!("{}: {how_far}", self.what))
     }
 }
 
-/// The last count that COLMAP printed, and the total: files as [3/48], blocks of pairs as [1/6, 2/6], and one line per
-/// registered photograph, whose total is unknown: 0.
-fn counted(printed: &str) -> Option<[usize; 2]> {
+/// The last count that COLMAP printed, and the total: files as [3/48], blocks of pairs as [1/6, 2/6], and photographs
+/// that the current model has, as "Registering image #9 (4)".
+fn counted(printed: &str, photographs: usize) -> Option<[usize; 2]> {
     let bracket = |line: &str| {
         let inside = line.split_once('[')?.1.split_once(']')?.0;
         let pairs = inside.split(',').map(|pair| {
@@ -52,9 +50,16 @@ fn counted(printed: &str) -> Option<[usize; 2]> {
             _ => None,
         }
     };
-    let registered = printed.lines().filter(|line| line.contains("Registering image #")).count();
-    let by_line = printed.lines().rev().find_map(bracket);
-    if registered > 0 { Some([registered, 0]) } else { by_line }
+    let registered = |line: &str| {
+        let inside =
+            line.split_once("Registering image #")?.1.split_once('(')?.1.split_once(')')?.0;
+        // COLMAP from 3.12 on names the number.
+        let count: usize =
+            inside.trim_start_matches(|letter: char| !letter.is_ascii_digit()).parse().ok()?;
+        Some([count.min(photographs), photographs])
+    };
+    let lines = || printed.lines().rev();
+    lines().find_map(registered).or_else(|| lines().find_map(bracket))
 }
 
 #[cfg(test)]
@@ -70,13 +75,16 @@ mod tests {
             ),
             ("Matching block [2/6, 5/6] in 0.1s\nI2026 Matching block [3/6, 1/6]", Some([13, 36])),
             ("Matching image [7/20] in", Some([7, 20])),
-            ("Registering image #4 (3)\n x [1/2]\nRegistering image #9 (4)\n", Some([2, 0])),
+            ("Registering image #4 (3)\n x [1/2]\nRegistering image #9 (4)\n", Some([4, 24])),
+            ("I2026] Registering image #4 (num_reg_frames=3)", Some([3, 24])),
+            ("Registering image #9 (24)\nRegistering image #3 (25)\n => failed", Some([24, 24])),
+            ("Registering image #9 (24)\nInitializing\nRegistering image #1 (3)", Some([3, 24])),
             ("[no/count]\nnothing [", None),
         ];
         for (printed, expected) in cases {
-            assert_eq!(counted(printed), expected, "{printed}");
+            assert_eq!(counted(printed, 24), expected, "{printed}");
         }
-        let mut stage = StageProgress::new("matching");
+        let mut stage = StageProgress::new("matching", 24);
         assert_eq!(stage.due("Matching block [1/1, 1/1]"), None, "too early");
         stage.last = Instant::now().checked_sub(INTERVAL).unwrap();
         assert_eq!(stage.due("Matching block [1/2, 1/2]").unwrap(), "matching: 1 of 4");

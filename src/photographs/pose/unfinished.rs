@@ -1,28 +1,33 @@
 //! The dataset while it is written.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use super::pictures::PosePhotographs;
 use crate::base::output::{create_folder, write_whole};
 use crate::base::{input, tree};
-use crate::photographs::dataset::{Dataset, is_mask};
-use crate::photographs::image::files::{photographs_in, stem};
+use crate::photographs::dataset::{Dataset, is_mask, mask_beside};
+use crate::photographs::image::files::{PhotographFiles, photographs_in, stem};
 use crate::{Error, Result};
 
 /// Creates a hard link in `folder`, or a copy if the file system has no links.
 fn link_or_copy(from: &Path, folder: &Path) -> Result<()> {
-    let to = folder.join(from.file_name().unwrap_or_default());
+    link_or_copy_to(from, &folder.join(from.file_name().unwrap_or_default()))
+}
+
+/// [`link_or_copy`] under another name.
+pub(super) fn link_or_copy_to(from: &Path, to: &Path) -> Result<()> {
     if tree::archive_of(from).is_some() {
-        return write_whole(&to, &input::bytes(from)?);
+        return write_whole(to, &input::bytes(from)?);
     }
     let from = from.canonicalize().unwrap_or_else(|_| from.to_owned());
-    if fs::hard_link(&from, &to).is_ok() {
+    if fs::hard_link(&from, to).is_ok() {
         return Ok(());
     }
-    fs::copy(&from, &to)
+    fs::copy(&from, to)
         .map(drop)
-        .map_err(|error| Error::output(&to, format!("cannot be written: {error}")))
+        .map_err(|error| Error::output(to, format!("cannot be written: {error}")))
 }
 
 /// A dataset under a temporary name, removed unless it is finished.
@@ -96,6 +101,29 @@ impl Unfinished {
         let images = self.folder.join("images");
         let files = photographs_in(source)?;
         files.iter().filter(|file| is_mask(file)).try_for_each(|mask| link_or_copy(mask, &images))
+    }
+
+    /// Adds the masks that COLMAP had of those of `photographs` that are placed and have no mask of their own to the
+    /// dataset `below` this one.
+    pub(super) fn add_masks_in_place(
+        &self,
+        below: &str,
+        pictures: &PosePhotographs,
+        photographs: &[PathBuf],
+        placed: &[String],
+    ) -> Result<()> {
+        let (folder, files) = (self.folder.join(below).join("masks"), PhotographFiles::default());
+        let placed: BTreeSet<&str> = placed.iter().map(|name| stem(name)).collect();
+        for photograph in photographs {
+            let name = photograph.file_name().unwrap_or_default().to_string_lossy();
+            let (name, mask) = (stem(&name), pictures.mask(photograph));
+            if placed.contains(name) && mask.is_file() && mask_beside(photograph, &files).is_none()
+            {
+                create_folder(&folder)?;
+                link_or_copy_to(&mask, &folder.join(format!("{name}.png")))?;
+            }
+        }
+        Ok(())
     }
 
     /// Adds the files of a COLMAP model to the dataset `below` this one; where names are given anew, with the images

@@ -8,6 +8,7 @@ use super::load;
 use super::pose::{line, models, photographed, stub};
 use super::synthetic::*;
 use crate::common::command::{refused, run};
+use nightsplat::photographs::image::Image;
 
 /// Copies a photograph and sets its equivalent focal length in Exif.
 fn taken_at(path: &Path, focal: u8) {
@@ -84,6 +85,55 @@ fn an_implausible_calibration_is_reported() {
         );
         assert!(stdout.contains("40x30 with focal length 35"), "{stdout}");
     }
+    let cameras = vec![(3, "PINHOLE", 1, vec![35.0, 93.0, 20.0, 15.0])];
+    Model { cameras, ..model(9) }.write_binary(&root.join("models/0"));
+    let arguments = line(&photos, &root.join("none"), &stub(root, &models(root)), "");
+    let parts = [
+        "photos: COLMAP's calibration cannot be, 40x30 with focal length 35 x 93",
+        "2.7 times",
+        "--camera-model",
+    ];
+    let (_, stderr) = run(&arguments, 3);
+    let error = stderr.lines().find(|line| line.starts_with("error: ")).unwrap();
+    assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+    assert!(!root.join("none").exists() && root.join("none.colmap.log").is_file());
+}
+
+#[test]
+fn what_is_burnt_in_has_no_features_and_is_masked_in_the_dataset() {
+    let root = &Folder::empty();
+    let (photos, out, seen) = (photographed(root), root.join("scene"), root.join("seen"));
+    let is_text = |x: u32, y: u32| (2..22).contains(&x) && (25..29).contains(&y);
+    for index in 0..9 {
+        let value = |x: u32, y: u32| match is_text(x, y) {
+            true => f32::from(u8::from(x % 5 < 2)),
+            false => {
+                0.1 * ((((x + 7 * index) / 4) * 7 + (y + 5 * index) / 3 * 13) % 11) as f32 / 11.0
+            }
+        };
+        let picture = Image::from_fn(SIZE.0, SIZE.1, |x, y| [value(x, y); 3]);
+        picture.save_png8(photos.join(format!("v{index:02}.png"))).unwrap();
+    }
+    photograph(&photos.join("masks/v03.png"), SIZE, 1.0);
+    photograph(&photos.join("masks/v04.png"), SIZE, 0.0);
+    model(9).write_binary(&root.join("models/0"));
+    let cases = format!("feature_extractor) cp -r $masks {};;\n{}", seen.display(), models(root));
+    let (_, stderr) = run(&line(&photos, &out, &stub(root, &cases), ""), 0);
+    assert!(stderr.contains(" % of the photographs of 40x30 hardly changes"), "{stderr}");
+    let shown =
+        |mask: &Path, x: u32, y: u32| Image::load(mask).unwrap().data[(40 * y + x) as usize] > 0.0;
+    for mask in [seen.join("v03.png.png"), seen.join("v08.png.png"), out.join("masks/v08.png")] {
+        let pixels = || (0..SIZE.1).flat_map(|y| (0..SIZE.0).map(move |x| (x, y)));
+        assert!(pixels().all(|(x, y)| !is_text(x, y) || !shown(&mask, x, y)), "{mask:?}");
+        assert!(pixels().all(|(x, y)| y > 20 || shown(&mask, x, y)), "{mask:?}");
+    }
+    // Masks of the photographs count for both, and stay as they are in the dataset.
+    assert!(!shown(&seen.join("v04.png.png"), 0, 0));
+    assert!(shown(&out.join("masks/v03.png"), 5, 25));
+    let dataset = load(&out);
+    let masked = dataset.views.iter().filter(|view| view.mask.is_some());
+    let masked: Vec<&str> = masked.map(|view| view.name.as_str()).collect();
+    assert_eq!(masked, ["v00", "v01", "v02", "v05", "v06", "v07", "v08"]);
 }
 
 #[test]
