@@ -4,8 +4,9 @@ use std::io::{IsTerminal, Write};
 use std::process::ExitCode;
 
 use nightsplat::Error;
-use nightsplat::cli::{Cli, Phases, hint, in_one_line, message};
+use nightsplat::cli::{Cli, Phases, event_field, hint, message, one_line};
 use tracing_subscriber::filter::{LevelFilter, filter_fn};
+use tracing_subscriber::fmt::format::debug_fn;
 use tracing_subscriber::prelude::*;
 
 fn main() -> ExitCode {
@@ -21,6 +22,7 @@ fn main() -> ExitCode {
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
+        .fmt_fields(debug_fn(event_field))
         .with_target(false)
         .without_time();
     let is_line = filter_fn(move |metadata| metadata.is_event() && *metadata.level() <= level);
@@ -35,7 +37,7 @@ fn main() -> ExitCode {
     }
     // Standard error may be closed.
     let message = message(&error);
-    let _ = writeln!(std::io::stderr(), "error: {}", in_one_line(&message));
+    let _ = writeln!(std::io::stderr(), "error: {}", one_line(&message));
     ExitCode::from(error.downcast_ref::<Error>().map_or(1, Error::exit_code))
 }
 
@@ -57,7 +59,7 @@ fn misuse(error: &clap::Error) -> ExitCode {
     let line = told.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
     let line = hint(error).map_or(line, |line| format!("error: {line}"));
     // Standard error may be closed.
-    let _ = writeln!(std::io::stderr(), "{}; see --help", in_one_line(&line));
+    let _ = writeln!(std::io::stderr(), "{}; see --help", one_line(&line));
     ExitCode::from(2)
 }
 

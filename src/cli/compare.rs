@@ -8,7 +8,7 @@ use anyhow::Result;
 use super::eval::LpipsRange;
 use super::{driver, finish, table, word};
 use crate::Error;
-use crate::base::output::{check_writable, write_whole};
+use crate::base::output::{check_writable, one_line, write_whole};
 use crate::gpu::DeviceChoice;
 use crate::results::comparison::{CompareOptions, RunComparison};
 
@@ -74,7 +74,7 @@ pub fn run(args: &CompareArgs) -> Result<()> {
         .map(|table_of_scores| table::text(&table_of_scores));
     writeln!(out, "{}", tables.join("\n"))?;
     for [key, values] in comparison.settings() {
-        writeln!(out, "{key}: {values}")?;
+        writeln!(out, "{}", one_line(&format!("{key}: {values}")))?;
     }
     if let Some(label) = comparison.label() {
         writeln!(out, "{label}")?;

@@ -10,7 +10,7 @@ use anyhow::Result;
 use self::operations::Operations;
 use super::{driver, finish, word};
 use crate::Error;
-use crate::base::output::{check_writable, printable};
+use crate::base::output::{check_writable, one_line};
 use crate::gpu::DeviceChoice;
 use crate::results::edit::{EditList, Editor};
 
@@ -70,7 +70,7 @@ pub fn run(args: &EditArgs) -> Result<()> {
     let listed = list.iter().flat_map(|list| &list.edits);
     let mut out = std::io::stdout().lock();
     for operation in listed.chain(args.operations.iter()) {
-        writeln!(out, "{}", printable(&editor.apply(operation)?))?;
+        writeln!(out, "{}", one_line(&editor.apply(operation)?))?;
     }
     drop(out);
     let mut wrote = editor.save(&args.out)?;

@@ -12,7 +12,7 @@ pub(crate) use self::options::TrainOptions;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
 use super::{driver, finish, live, phases, signals, view, word};
-use crate::base::output::{check_writable, printable};
+use crate::base::output::{check_writable, one_line, printable};
 use crate::camera::frame;
 use crate::gpu::DeviceChoice;
 use crate::results::eval;
@@ -174,7 +174,7 @@ fn next(args: &TrainArgs) -> String {
 
 fn print_done(args: &TrainArgs, steps: u64) -> Result<()> {
     let done = format!("{} is done: {steps} steps", args.out.display());
-    writeln!(std::io::stdout(), "{}", printable(&done))?;
+    writeln!(std::io::stdout(), "{}", one_line(&done))?;
     finish("", &next(args))
 }
 
