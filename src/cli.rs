@@ -261,8 +261,8 @@ mod tests {
         use tracing_subscriber::prelude::*;
 
         #[derive(Clone, Default)]
-        struct Lines(Arc<Mutex<String>>);
-        impl<S: tracing::Subscriber> tracing_subscriber::Layer<S> for Lines {
+        struct LastEvent(Arc<Mutex<String>>);
+        impl<S: tracing::Subscriber> tracing_subscriber::Layer<S> for LastEvent {
             fn on_event(
                 &self,
                 event: &tracing::Event<'_>,
@@ -274,7 +274,7 @@ mod tests {
                 self.0.lock().unwrap().push_str(&line);
             }
         }
-        let lines = Lines::default();
+        let lines = LastEvent::default();
         tracing::subscriber::with_default(
             tracing_subscriber::registry().with(lines.clone()),
             || {

@@ -36,7 +36,7 @@ pub fn cells(line: &str) -> Vec<String> {
     cells
 }
 
-/// The cells of a line of a table of so many columns. If the line has more, the first cell has commas and no quotes.
+/// The cells of a line of a table of `columns`. If the line has more, the first cell has commas and no quotes.
 pub fn cells_of(line: &str, columns: usize) -> Vec<String> {
     let mut cells = cells(line);
     let of_first = (cells.len() + 1).saturating_sub(columns);
