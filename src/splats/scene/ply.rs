@@ -1,6 +1,7 @@
 //! Gaussians as a PLY file in the INRIA layout, which splat viewers open.
 //!
-//! Binary little-endian, as written, or text: one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`.
+//! Binary little-endian, as written, or text, with one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity
+//! scale_0..2 rot_0..3`.
 //! Positions far from the world's origin are relative to another origin, given in a comment: `world = position + X Y
 //! Z`. Other comments state the settings of a renderer, such as `nightsplat near 0.1`: [`ModelFacts`]. Features, if
 //! any, are between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`, which viewers skip.
@@ -186,7 +187,8 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, ModelFacts), String> {
     let (gaussians, facts) = parse_any(bytes)?;
     for property in properties(gaussians.shape) {
         let (begin, stride) = property.address(&gaussians);
-        let mut values = gaussians.parameters[begin..].iter().step_by(stride).take(gaussians.count);
+        let values = gaussians.parameters.iter().skip(begin).step_by(stride);
+        let mut values = values.take(gaussians.count);
         if let Some(vertex) = values.position(|value| !value.is_finite()) {
             let (name, value) = (property.name, gaussians.parameters[begin + stride * vertex]);
             return Err(format!("vertex {vertex}: `{name}` is {value}, not a finite number"));
