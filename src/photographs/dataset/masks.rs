@@ -30,7 +30,7 @@ fn moving(frame: &ViewEntry, files: &PhotographFiles) -> Option<MaskFile> {
     let file = frame.file.as_ref()?;
     let name = file.file_name()?.to_str()?;
     let path = files.find(file.parent()?, &format!("{MOVING}{name}"))?;
-    Some(MaskFile { path, is_inverted: true })
+    Some(MaskFile { is_inverted: true, ..MaskFile::shown(path) })
 }
 
 /// Whether a file is a mask in a folder of photographs.
