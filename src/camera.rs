@@ -313,6 +313,28 @@ impl Lens {
     }
 }
 
+impl Lens {
+    /// Whether it may be of the input of a network that works on patches of 14 pixels (`VGGT`).
+    pub(crate) fn is_of_patches(&self) -> bool {
+        [self.width, self.height].iter().all(|side| *side >= 224 && side.is_multiple_of(14))
+    }
+
+    /// The lens for a photograph of `width` x `height` that was resized to a network's input, each side rounded to
+    /// patches; `None` if this is none, or the aspect ratio differs by more.
+    pub(crate) fn fitted_from_patches(&self, width: u32, height: u32) -> Option<Self> {
+        let listed = DVec2::new(f64::from(self.width), f64::from(self.height));
+        let scale = DVec2::new(f64::from(width), f64::from(height)) / listed;
+        let off_by = (listed * (1.0 - scale.yx() / scale)).abs().min_element();
+        (width > 0 && height > 0 && self.is_of_patches() && off_by <= 7.0).then_some(Self {
+            width,
+            height,
+            focal: self.focal * scale,
+            principal_point: self.principal_point * scale,
+            distortion: self.distortion,
+        })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -532,6 +554,13 @@ mod tests {
         for (width, height) in [(375, 500), (400, 375), (500, 380), (0, 0)] {
             assert_eq!(lens.fitted(width, height), None, "{width}x{height}");
         }
+        let patches = Lens { width: 518, height: 392, ..lens };
+        let fitted = patches.fitted_from_patches(500, 375).unwrap();
+        assert_eq!((fitted.width, fitted.height), (500, 375));
+        assert!((fitted.focal.y - 510.0 * 375.0 / 392.0).abs() < 1e-9, "{fitted:?}");
+        assert_eq!(patches.fitted(500, 375).or(lens.fitted_from_patches(500, 380)), None);
+        let padded = Lens { height: 518, ..patches };
+        assert_eq!(padded.fitted_from_patches(500, 375), None);
     }
 
     #[test]

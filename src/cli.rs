@@ -1,13 +1,16 @@
 //! The command line: one file per subcommand.
 
 use std::ffi::OsString;
+use std::fmt;
 use std::path::Path;
 
 use anyhow::Result;
 use clap::{FromArgMatches, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
+use tracing::field::Field;
+use tracing_subscriber::fmt::format::Writer;
 
-use crate::base::output::printable;
+pub use crate::base::output::one_line;
 use crate::base::settings::Setting;
 use crate::photographs::image::Image;
 use crate::train::settings::setting;
@@ -170,8 +173,9 @@ pub fn message(error: &anyhow::Error) -> String {
 
 /// Tells the end of a command: the files that it wrote, if any, and the command to run next.
 fn finish(wrote: &str, next: &str) {
-    let wrote = if wrote.is_empty() { String::new() } else { format!("wrote {wrote}\n") };
-    tell(format_args!("{}next: {}", printable(&wrote), printable(next)));
+    let wrote =
+        if wrote.is_empty() { String::new() } else { format!("wrote {}\n", one_line(wrote)) };
+    tell(format_args!("{wrote}next: {}", one_line(next)));
 }
 
 /// A path as a word of a command.
@@ -188,9 +192,13 @@ fn quoted(word: &str) -> String {
     format!("'{}'", word.replace('\'', "'\\''"))
 }
 
-/// A message on one line, with control characters in names escaped.
-pub fn in_one_line(message: &str) -> String {
-    printable(&message.replace('\n', "\\n")).into_owned()
+/// Writes a field of an event on one line, whatever the names in it contain.
+pub fn event_field(writer: &mut Writer<'_>, field: &Field, value: &dyn fmt::Debug) -> fmt::Result {
+    let text = format!("{value:?}");
+    match field.name() {
+        "message" => write!(writer, "{}", one_line(&text)),
+        name => write!(writer, "{name}={}", one_line(&text)),
+    }
 }
 
 /// Image formats for output.
@@ -231,6 +239,8 @@ fn progress_bar(len: usize) -> ProgressBar {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::{Arc, Mutex};
+
     use super::*;
 
     #[test]
@@ -245,6 +255,35 @@ mod tests {
             "density.control (--density) is 0; it must be at least 1"
         );
         assert_eq!(refused("stop.every"), "stop.every is 0; it must be at least 1");
+    }
+
+    #[test]
+    fn a_warning_is_one_line_whatever_names_it_has() {
+        use tracing_subscriber::fmt::format::{FormatFields, debug_fn};
+        use tracing_subscriber::prelude::*;
+
+        #[derive(Clone, Default)]
+        struct LastEvent(Arc<Mutex<String>>);
+        impl<S: tracing::Subscriber> tracing_subscriber::Layer<S> for LastEvent {
+            fn on_event(
+                &self,
+                event: &tracing::Event<'_>,
+                _: tracing_subscriber::layer::Context<'_, S>,
+            ) {
+                let mut line = String::new();
+                let fields = debug_fn(event_field);
+                fields.format_fields(Writer::new(&mut line), event).unwrap();
+                self.0.lock().unwrap().push_str(&line);
+            }
+        }
+        let lines = LastEvent::default();
+        tracing::subscriber::with_default(
+            tracing_subscriber::registry().with(lines.clone()),
+            || {
+                tracing::warn!("skipped {}", "no\nerror: lost\u{202e}.png");
+            },
+        );
+        assert_eq!(*lines.0.lock().unwrap(), r"skipped no\nerror: lost\u{202e}.png");
     }
 
     #[test]

@@ -2,6 +2,7 @@
 //!
 //! A message names a setting by its key in config.toml: `max_gaussians`, `density.depth_seeding`.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 /// The result of everything in this crate that can fail.
@@ -12,7 +13,7 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 #[non_exhaustive]
 pub enum Error {
     /// An input file or folder is missing, truncated or invalid.
-    #[error("{}: {problem}", path.display())]
+    #[error("{}: {problem}", one_line(&path.to_string_lossy()))]
     Input {
         /// The file or folder.
         path: PathBuf,
@@ -20,7 +21,7 @@ pub enum Error {
         problem: String,
     },
     /// A file or folder could not be written.
-    #[error("{}: {problem}", path.display())]
+    #[error("{}: {problem}", one_line(&path.to_string_lossy()))]
     Output {
         /// The file or folder.
         path: PathBuf,
@@ -233,17 +234,36 @@ impl Error {
     }
 }
 
-/// Escapes line breaks, and truncates to a thousand characters.
+/// Escapes what [`one_line`] escapes, and truncates to a thousand characters.
 fn in_a_line(text: String) -> String {
     const MOST: usize = 1000;
-    if text.len() <= MOST && !text.contains('\n') {
-        return text;
-    }
-    let line = text.replace('\n', "\\n");
+    let line = one_line(&text);
     match line.char_indices().nth(MOST) {
         Some((end, _)) => format!("{} ...", &line[..end]),
-        None => line,
+        None => line.into_owned(),
     }
+}
+
+/// A name or a message on one line: characters that act on a terminal, line breaks included, are escaped.
+pub fn one_line(text: &str) -> Cow<'_, str> {
+    escaped(text, acts)
+}
+
+/// Text with the characters that are meant spelled as in Rust's literals.
+pub(crate) fn escaped(text: &str, is_meant: impl Fn(char) -> bool) -> Cow<'_, str> {
+    if !text.contains(&is_meant) {
+        return Cow::Borrowed(text);
+    }
+    let spelled =
+        |c: char| if is_meant(c) { c.escape_default().to_string() } else { c.to_string() };
+    Cow::Owned(text.chars().map(spelled).collect())
+}
+
+/// Whether a character acts on a terminal or the lines and the order of a text: control characters, separators of lines
+/// and paragraphs, and marks of bidirectional text.
+pub(crate) fn acts(c: char) -> bool {
+    let is_mark = matches!(c, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+    is_mark || c.is_control()
 }
 
 /// The reason why a run stopped before its end, with its state saved.
@@ -295,6 +315,8 @@ mod tests {
     fn quoted_text_becomes_one_line_of_limited_length() {
         let printed = |problem: &str| Error::input("file", problem).to_string();
         assert_eq!(printed("is no\nnumber"), r"file: is no\nnumber");
+        let path = Error::output("a\nerror: b\u{202e}", "is full").to_string();
+        assert_eq!(path, r"a\nerror: b\u{202e}: is full");
         let endless = printed(&"ö\n".repeat(5000));
         assert!(endless.chars().count() < 1020 && endless.ends_with(" ..."), "{endless}");
     }

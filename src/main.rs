@@ -4,8 +4,9 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use nightsplat::Error;
-use nightsplat::cli::{Cli, Phases, hint, in_one_line, message, tell_on_stderr};
+use nightsplat::cli::{Cli, Phases, event_field, hint, message, one_line, tell_on_stderr};
 use tracing_subscriber::filter::{LevelFilter, filter_fn};
+use tracing_subscriber::fmt::format::debug_fn;
 use tracing_subscriber::prelude::*;
 
 fn main() -> ExitCode {
@@ -21,6 +22,7 @@ fn main() -> ExitCode {
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
+        .fmt_fields(debug_fn(event_field))
         .with_target(false)
         // They would be told on standard error, which is what has failed.
         .log_internal_errors(false)
@@ -32,7 +34,7 @@ fn main() -> ExitCode {
         .with(phases)
         .init();
     let Err(error) = cli.run() else { return ExitCode::SUCCESS };
-    tell_on_stderr(format_args!("error: {}", in_one_line(&message(&error))));
+    tell_on_stderr(format_args!("error: {}", one_line(&message(&error))));
     ExitCode::from(error.downcast_ref::<Error>().map_or(1, Error::exit_code))
 }
 
@@ -53,6 +55,6 @@ fn misuse(error: &clap::Error) -> ExitCode {
         lines.take_while(|line| !line.starts_with("Usage:") && !line.starts_with("For more"));
     let line = told.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
     let line = hint(error).map_or(line, |line| format!("error: {line}"));
-    tell_on_stderr(format_args!("{}; see --help", in_one_line(&line)));
+    tell_on_stderr(format_args!("{}; see --help", one_line(&line)));
     ExitCode::from(2)
 }

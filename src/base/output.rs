@@ -5,6 +5,8 @@ use std::path::Path;
 #[cfg(feature = "io")]
 use std::path::PathBuf;
 
+pub use crate::error::one_line;
+use crate::error::{acts, escaped};
 use crate::{Error, Result};
 
 /// Writes a file under a temporary name and renames it when complete.
@@ -79,6 +81,13 @@ pub fn create_folder(folder: &Path) -> Result<()> {
         .map_err(|error| Error::output(folder, format!("cannot be created: {error}")))
 }
 
+/// Creates the folder of a file unless it exists.
+#[cfg(feature = "io")]
+pub fn create_folder_of(file: &Path) -> Result<()> {
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
+    folder.map_or(Ok(()), create_folder)
+}
+
 /// Whether two paths name the same file.
 pub fn is_same_file(a: &Path, b: &Path) -> bool {
     a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
@@ -102,21 +111,10 @@ pub fn check_writable(path: &Path) -> Result<()> {
     })
 }
 
-/// Text for a terminal or a line of a log: control characters, which foreign names may contain, are escaped. Line
-/// breaks are kept.
+/// Text for a terminal: control characters and those of bidirectional text, which foreign names may contain, are
+/// escaped. Line breaks are kept.
 pub fn printable(text: &str) -> Cow<'_, str> {
-    let acts = |c: char| c.is_control() && c != '\n';
-    if !text.contains(acts) {
-        return Cow::Borrowed(text);
-    }
-    let spelled = |c: char| if acts(c) { c.escape_default().to_string() } else { c.to_string() };
-    Cow::Owned(text.chars().map(spelled).collect())
-}
-
-/// A field of a CSV file (RFC 4180) on one line: control characters, including line breaks, become underscores.
-pub fn csv_field(text: &str) -> String {
-    let plain = text.replace(char::is_control, "_");
-    if plain.contains([',', '"']) { format!("\"{}\"", plain.replace('"', "\"\"")) } else { plain }
+    escaped(text, |c| acts(c) && c != '\n')
 }
 
 #[cfg(test)]
@@ -165,21 +163,9 @@ mod tests {
     }
 
     #[test]
-    fn control_characters_are_escaped() {
+    fn characters_that_act_on_a_terminal_are_escaped() {
         assert_eq!(printable("größer\nline"), "größer\nline");
         assert_eq!(printable("\u{1b}[31mred\r\u{9b}2J\u{7}"), r"\u{1b}[31mred\r\u{9b}2J\u{7}");
-    }
-
-    #[test]
-    fn a_field_stays_one_field_on_one_line() {
-        for (text, field) in [
-            ("IMG_1", "IMG_1"),
-            ("a,b", "\"a,b\""),
-            ("say \"no\"", "\"say \"\"no\"\"\""),
-            ("two\nlines", "two_lines"),
-            ("\u{1b}[2J,x", "\"_[2J,x\""),
-        ] {
-            assert_eq!(csv_field(text), field);
-        }
+        assert_eq!(one_line("a\nerror: b\u{202e}gnp\u{2069}"), r"a\nerror: b\u{202e}gnp\u{2069}");
     }
 }

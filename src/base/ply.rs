@@ -1,5 +1,9 @@
 //! Headers of PLY files whose vertices come first: models of Gaussians, and clouds of points.
 
+/// The remedy for models in formats of other programs.
+pub const CONVERTER: &str =
+    "convert it with `npx @playcanvas/splat-transform IN OUT.ply`, or save it as PLY in SuperSplat";
+
 /// How vertices are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PlyEncoding {
@@ -123,6 +127,9 @@ impl PlyHeader {
                     in_vertices = true;
                     header.count =
                         count.parse().map_err(|_| format!("`{count}` is not a vertex count"))?;
+                }
+                ["element", "chunk", _] if !in_vertices => {
+                    return Err(format!("is a compressed PLY of PlayCanvas; {CONVERTER}"));
                 }
                 ["element", name, _] if !in_vertices => {
                     return Err(format!(

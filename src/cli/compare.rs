@@ -7,7 +7,7 @@ use anyhow::Result;
 use super::eval::LpipsRange;
 use super::{driver, finish, print, table, word};
 use crate::Error;
-use crate::base::output::{check_writable, write_whole};
+use crate::base::output::{check_writable, one_line, write_whole};
 use crate::gpu::DeviceChoice;
 use crate::results::comparison::{CompareOptions, RunComparison};
 
@@ -72,7 +72,7 @@ pub fn run(args: &CompareArgs) -> Result<()> {
         .map(|table_of_scores| table::text(&table_of_scores));
     print(tables.join("\n") + "\n")?;
     for [key, values] in comparison.settings() {
-        print(format_args!("{key}: {values}"))?;
+        print(one_line(&format!("{key}: {values}")))?;
     }
     if let Some(label) = comparison.label() {
         print(label)?;

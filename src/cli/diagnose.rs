@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::settings::{Selection, SettingOptions, push_dataset};
 use super::{driver, finish, print, table, word, words};
 use crate::Error;
-use crate::base::output::{check_writable, write_whole};
+use crate::base::output::{check_writable, one_line, write_whole};
 use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::Dataset;
 use crate::results::diagnosis;
@@ -157,7 +157,7 @@ fn text(device: &str, dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> 
     let Diagnosis { views, test_views, remarks, .. } = diagnosis;
     let mut text = format!(
         "{}\n{} photographs to train on ({}), {test_views} held out, {} points; on {device}\n\n",
-        dataset.root.display(),
+        one_line(&dataset.root.to_string_lossy()),
         views.len(),
         diagnosis::sizes(views),
         dataset.points.len()
@@ -168,7 +168,7 @@ fn text(device: &str, dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> 
         text += &format!("{name:<12}{figures}\n");
     }
     for remark in remarks {
-        text += &format!("note: {remark}\n");
+        text += &format!("note: {}\n", one_line(remark));
     }
     text.push('\n');
     text + &decisions(plan)
@@ -181,7 +181,7 @@ pub(super) fn decisions(plan: &Plan) -> String {
         |of: fn(&(&str, String, &str)) -> usize| decisions.iter().map(of).max().unwrap_or(0);
     let (name, value) = (width(|one| one.0.len()), width(|one| one.1.len()));
     let line = |(part, decided, why): &(&str, String, &str)| {
-        format!("{part:name$}  {decided:value$}  {why}\n")
+        format!("{part:name$}  {decided:value$}  {}\n", one_line(why))
     };
     decisions.iter().map(line).collect()
 }

@@ -9,7 +9,7 @@ use anyhow::Result;
 use self::operations::Operations;
 use super::{driver, finish, tell, word};
 use crate::Error;
-use crate::base::output::{check_writable, printable};
+use crate::base::output::{check_writable, one_line};
 use crate::gpu::DeviceChoice;
 use crate::results::edit::{EditList, Editor};
 
@@ -68,7 +68,7 @@ pub fn run(args: &EditArgs) -> Result<()> {
     }
     let listed = list.iter().flat_map(|list| &list.edits);
     for operation in listed.chain(args.operations.iter()) {
-        tell(printable(&editor.apply(operation)?));
+        tell(one_line(&editor.apply(operation)?));
     }
     let mut wrote = editor.save(&args.out)?;
     if let Some(path) = &args.save_edits {

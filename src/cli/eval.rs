@@ -7,7 +7,7 @@ use indicatif::ProgressBar;
 
 use super::{driver, finish, print, progress_bar, table, word};
 use crate::Error;
-use crate::base::output::{check_writable, printable, write_whole};
+use crate::base::output::{check_writable, one_line, write_whole};
 use crate::gpu::DeviceChoice;
 use crate::networks::lpips::Range;
 use crate::photographs::dataset::DOWNSCALE;
@@ -109,7 +109,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     let scored = RunEvaluation::new(&args.run, &options, |index, count, view| {
         let bar = bar.get_or_insert_with(|| progress_bar(count));
         bar.set_position(index as u64);
-        bar.set_message(printable(view).into_owned());
+        bar.set_message(one_line(view).into_owned());
     });
     bar.iter().for_each(ProgressBar::finish_and_clear);
     let scored = scored?;
@@ -120,7 +120,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         return Ok(print(format_args!("{:#}", scored.json()))?);
     }
     print(table::text(&scored.evaluation.table()))?;
-    scored.notes().iter().try_for_each(print)?;
+    scored.notes().iter().try_for_each(|note| print(one_line(note)))?;
     let wrote = args.report.iter().chain(&images).map(|path| path.display().to_string());
     let next = format!("nightsplat render {} --split all --out pictures", word(&args.run));
     finish(&wrote.collect::<Vec<_>>().join(", "), &next);

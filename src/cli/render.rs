@@ -11,7 +11,7 @@ use self::shots::{Shot, shots};
 use super::words::NamedValues;
 use super::{OutputFormat, driver, finish, progress_bar, word};
 use crate::Error;
-use crate::base::output::{check_writable, create_folder, printable};
+use crate::base::output::{check_writable, create_folder, one_line};
 use crate::camera::Easing;
 use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::{Dataset, Split, View};
@@ -297,7 +297,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     make_folder(out, &dataset, run)?;
     let bar = progress_bar(shots.len());
     for Shot { name, camera, orientation } in &shots {
-        bar.set_message(printable(name).into_owned());
+        bar.set_message(one_line(name).into_owned());
         let path = file(out, name, *format);
         let mut color = |image: Image| {
             let image = image.turned(*orientation);

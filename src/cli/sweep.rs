@@ -241,8 +241,8 @@ fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
     let first = &runs[0].config;
     let dataset = Dataset::load(&first.dataset, &diagnosed(first))?;
     if !dataset.test_views().any(|view| view.has_reference() || view.has_photograph()) {
-        let problem = "has no held-out view to score; list one in transforms_test.json or test.txt, or add \
-         photographs: every eighth is held out";
+        let problem = "has no held-out view to score; pass --test-every N, or list one in transforms_test.json or \
+         test.txt: of eight photographs or more every eighth is held out";
         return Err(Error::input(&dataset.root, problem));
     }
     if !dataset.train_views().any(|view| view.depth.is_some()) {

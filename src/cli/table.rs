@@ -1,6 +1,6 @@
 //! Tables for the terminal.
 
-use crate::base::output::printable;
+use crate::base::output::one_line;
 use crate::results::report::{Column, NumberTable};
 
 /// A table of the report as text.
@@ -22,14 +22,14 @@ pub(super) fn text(table: &NumberTable) -> String {
 pub(super) fn aligned(rows: &[Vec<String>]) -> String {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let cell_width = |row: &Vec<String>, column: usize| {
-        row.get(column).map_or(0, |cell| printable(cell).chars().count())
+        row.get(column).map_or(0, |cell| one_line(cell).chars().count())
     };
     let widths: Vec<usize> = (0..columns)
         .map(|column| rows.iter().map(|row| cell_width(row, column)).max().unwrap_or(0))
         .collect();
     let line = |row: &Vec<String>| {
         let cells = row.iter().zip(&widths).enumerate().map(|(column, (cell, &width))| {
-            let cell = printable(cell);
+            let cell = one_line(cell);
             if column == 0 { format!("{cell:width$}") } else { format!("  {cell:>width$}") }
         });
         cells.collect::<String>().trim_end().to_owned() + "\n"
@@ -47,5 +47,7 @@ mod tests {
         let rows = rows.map(|row| row.map(str::to_owned).to_vec());
         assert_eq!(aligned(&rows), "view     PSNR\na       24.50\ngrößer    7.1\n");
         assert_eq!(aligned(&[]), "");
+        let forged = [["a\nerror: lost", "1"].map(str::to_owned).to_vec()];
+        assert_eq!(aligned(&forged), "a\\nerror: lost  1\n");
     }
 }

@@ -11,7 +11,7 @@ pub(crate) use self::options::TrainOptions;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
 use super::{driver, finish, live, phases, print, signals, tell, view, word};
-use crate::base::output::{check_writable, printable};
+use crate::base::output::{check_writable, one_line, printable};
 use crate::camera::frame;
 use crate::gpu::DeviceChoice;
 use crate::results::eval;
@@ -175,7 +175,7 @@ fn next(args: &TrainArgs) -> String {
 
 fn tell_done(args: &TrainArgs, steps: u64) {
     let done = format!("{} is done: {steps} steps", args.out.display());
-    tell(printable(&done));
+    tell(one_line(&done));
     finish("", &next(args));
 }
 

@@ -4,6 +4,7 @@
 //! ignores: without this module every job of a node would run on its first GPU.
 
 use std::fmt;
+use std::path::Path;
 use std::str::FromStr;
 
 use super::{DeviceReport, PciAddress};
@@ -83,6 +84,8 @@ pub(crate) struct SchedulerVariables {
     cuda: Option<String>,
     /// `CUDA_DEVICE_ORDER`: what the indices count.
     cuda_order: Option<String>,
+    /// Whether the machine has no NVIDIA driver: shells set `CUDA_VISIBLE_DEVICES` where there is no such device.
+    lacks_cuda: bool,
     /// `ROCR_VISIBLE_DEVICES`: indices and UUIDs of AMD devices.
     rocr: Option<String>,
     /// `HIP_VISIBLE_DEVICES`: indices into those that `ROCR_VISIBLE_DEVICES` leaves.
@@ -109,6 +112,9 @@ impl SchedulerVariables {
         Self {
             cuda: variable("CUDA_VISIBLE_DEVICES"),
             cuda_order: variable("CUDA_DEVICE_ORDER"),
+            lacks_cuda: ["/dev/nvidiactl", "/dev/dxg", "/proc/driver/nvidia"]
+                .iter()
+                .all(|driver| !Path::new(driver).exists()),
             rocr: variable("ROCR_VISIBLE_DEVICES"),
             hip: variable("HIP_VISIBLE_DEVICES"),
         }
@@ -151,7 +157,20 @@ impl SchedulerVariables {
         .filter_map(|(name, value)| Some(format!("{name}={}", value.as_ref()?.trim())))
         .collect();
         let set = set.join(" ");
-        let (visible, is_doubtful) = self.visible(devices)?;
+        let (visible, is_doubtful) = match self.visible(devices) {
+            Err(_)
+                if self.lacks_cuda
+                    && self.cuda.is_some()
+                    && of_vendor(devices, NVIDIA).is_empty() =>
+            {
+                let list = self.cuda.as_deref().unwrap_or_default();
+                tracing::warn!(
+                    "CUDA_VISIBLE_DEVICES={list} is ignored: the machine has no NVIDIA driver; unset it"
+                );
+                return Self { cuda: None, ..self.clone() }.best(devices);
+            }
+            found => found?,
+        };
         let suffices = |&&index: &&usize| devices[index].missing().is_none();
         let Some(&index) = visible.iter().find(suffices).or(visible.first()) else {
             return Err(no_such_device(&format!("{set} leaves no device"), devices));
@@ -329,7 +348,8 @@ mod tests {
 
     fn variables(cuda: Option<&str>, rocr: Option<&str>, hip: Option<&str>) -> SchedulerVariables {
         let [cuda, rocr, hip] = [cuda, rocr, hip].map(|value| value.map(str::to_owned));
-        SchedulerVariables { cuda, cuda_order: Some("PCI_BUS_ID".to_owned()), rocr, hip }
+        let cuda_order = Some("PCI_BUS_ID".to_owned());
+        SchedulerVariables { cuda, cuda_order, lacks_cuda: false, rocr, hip }
     }
 
     /// The name of the selected device, or the error message.
@@ -441,6 +461,14 @@ mod tests {
             best(&variables(Some("0"), None, None), software).contains("CUDA_VISIBLE_DEVICES=0")
         );
         assert_eq!(best(&variables(Some(""), None, None), software), "llvmpipe");
+        let lacking = |cuda, rocr| SchedulerVariables {
+            lacks_cuda: true,
+            ..variables(Some(cuda), rocr, None)
+        };
+        let picked = lacking("0", None).pick(&DeviceChoice::Best, software).unwrap();
+        assert_eq!((picked.index, picked.reason), (0, None));
+        assert!(best(&lacking("9", None), &node).contains("which Vulkan does not have"));
+        assert!(best(&lacking("0", Some("7")), software).contains("ROCR_VISIBLE_DEVICES=7"));
         // A scheduler that sets the variables of every vendor.
         assert_eq!(best(&variables(Some("1"), Some("1"), None), &node[..2]), "Nine");
         assert_eq!(best(&variables(Some("1"), Some("1"), None), &node[2..]), "Radeon");

@@ -152,10 +152,12 @@ impl Dataset {
         options.check()?;
         let files = PhotographFiles::default();
         let layout = DatasetLayout::detect(root)?;
-        let Listing { frames, mut skipped, remarks, clouds, has_split } =
+        let Listing { frames, mut skipped, mut remarks, clouds, has_split } =
             select(&layout, options, &files)?;
         log_split(&layout.root, has_split, options);
         let mut sources = sources(&layout.root, &frames, options, &files, &mut skipped);
+        let masks = sources.iter_mut().filter_map(|source| source.mask.as_mut());
+        remarks.extend(MaskFile::find_labels(masks));
         let headers = pixels::headers(&mut sources);
         let mut levels = levels(&layout, &sources, options, &files)?;
         let balance = white_balance_matrix(&layout.root, &sources, options, levels)?;
@@ -194,8 +196,8 @@ impl Dataset {
         Ok(dataset)
     }
 
-    /// The rule that selects the held-out views, in words.
-    pub(crate) fn split_rule(root: &Path, options: &LoadOptions) -> String {
+    /// The rule that selects the held-out views, of which there are `count`, in words.
+    pub(crate) fn split_rule(root: &Path, options: &LoadOptions, count: usize) -> String {
         let layout = DatasetLayout::detect(root).ok();
         let listings = layout.as_ref().map(DatasetLayout::listings).unwrap_or_default();
         let has_test = listings.iter().any(|(_, split)| *split == Some(Split::Test));
@@ -205,6 +207,11 @@ impl Dataset {
             Some(every) => format!("every {every}th by name, as requested"),
             None if has_test => "as the transforms files say".to_owned(),
             None if split::test_list(root).is_some() => "as test.txt says".to_owned(),
+            None if count == 0 => {
+                format!(
+                    "none of fewer than {TEST_EVERY} photographs; --test-every N holds some out"
+                )
+            }
             None => format!("every {TEST_EVERY}th by name"),
         }
     }
@@ -269,8 +276,10 @@ impl Dataset {
         options.check()?;
         let files = PhotographFiles::default();
         let layout = DatasetLayout::detect(root)?;
-        let Listing { frames, mut skipped, remarks, .. } = select(&layout, options, &files)?;
-        let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
+        let Listing { frames, mut skipped, mut remarks, .. } = select(&layout, options, &files)?;
+        let mut sources = sources(&layout.root, &frames, options, &files, &mut skipped);
+        let masks = sources.iter_mut().filter_map(|source| source.mask.as_mut());
+        remarks.extend(MaskFile::find_labels(masks));
         let photograph = |source: ViewFiles| {
             let ViewFiles { name, split, input, reference, mask, .. } = source;
             Some(Photograph { name, split, input: input?, reference, mask })

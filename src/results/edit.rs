@@ -24,7 +24,7 @@ use self::evidence::Measured;
 use self::floaters::{CameraPositions, Floaters};
 use self::placement::Placement;
 use self::step::Step;
-use crate::base::output::{check_writable, is_same_file, write_whole};
+use crate::base::output::{check_writable, create_folder_of, is_same_file, write_whole};
 use crate::base::ply::PlyHeader;
 use crate::camera::enclosing_sphere;
 use crate::results::export::{EDITS, Format, Provenance};
@@ -168,6 +168,7 @@ impl Editor {
         edits.push(self.list().line());
         let facts = self.facts;
         let provenance = Provenance { dataset, curve, facts, edits, ..Provenance::default() };
+        create_folder_of(out)?;
         match Format::from_path(out)? {
             Format::Ply => self.content.save_ply(&provenance, out)?,
             format => format.write(&*self.content.whole()?, &provenance, out)?,

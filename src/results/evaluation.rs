@@ -11,6 +11,7 @@ use super::finished_run::{FinishedRun, Opener, is_model};
 use super::report::{Chart, Comparison, Picture, Report, Series};
 use super::run;
 use crate::Result;
+use crate::base::csv;
 use crate::networks::lpips::{Lpips, Range};
 use crate::photographs::dataset::View;
 use crate::photographs::image::Image;
@@ -206,9 +207,8 @@ fn keep_worst(worst: &mut Vec<(f64, Comparison)>, images: &ScoredImages<'_>) {
 fn history(run: &Path) -> Vec<Chart> {
     let log = std::fs::read_to_string(run.join("train.csv")).unwrap_or_default();
     let point = |line: &str| {
-        let mut cells = line.split(',');
-        let step: f64 = cells.next()?.parse().ok()?;
-        Some((step, cells.nth(1)?.parse().ok()?))
+        let cells = csv::cells(line);
+        Some((cells[0].parse().ok()?, cells.get(2)?.parse().ok()?))
     };
     let losses: Vec<(f64, f64)> = log.lines().filter_map(point).collect();
     let mean = |points: &[(f64, f64)]| {

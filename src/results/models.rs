@@ -4,6 +4,7 @@ use std::path::Path;
 
 use crate::Result;
 use crate::base::input;
+use crate::base::ply::CONVERTER;
 use crate::error::Error;
 use crate::results::export::{sog, spz};
 use crate::results::run;
@@ -21,8 +22,8 @@ impl Model {
     /// [`RenderSettings::default`](crate::RenderSettings::default).
     ///
     /// # Errors
-    /// [`Error::Input`] if the file is missing, not a model, truncated or not finite, or states an invalid fact, or if
-    /// the run neither finished nor reached a checkpoint.
+    /// [`Error::Input`] if the file is missing, not a model or truncated, states an invalid fact, or has no Gaussian
+    /// that is finite, others being left out with a warning, or if the run neither finished nor reached a checkpoint.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
         let (gaussians, facts) = read(path.as_ref())?;
         Ok(Self::of_shown(gaussians, &facts))
@@ -30,7 +31,7 @@ impl Model {
 }
 
 /// The Gaussians in the colours that viewers show, and the facts that the file or the run's configuration states. Warns
-/// if the near plane is missing.
+/// if the near plane is missing, and of Gaussians of a file that are left out, as they are not finite.
 pub(crate) fn read(path: &Path) -> Result<(Gaussians, ModelFacts)> {
     if path.is_dir() {
         let config = run::load_config(path)?;
@@ -40,12 +41,18 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, ModelFacts)> {
     }
     let bytes = input::bytes(path)?;
     let parsed = match FileKind::from_bytes(&bytes) {
-        Some(FileKind::Ply) => ply::parse(&bytes),
+        Some(FileKind::Ply) => ply::parse_any(&bytes),
         Some(FileKind::Spz) => spz::decode(&bytes),
         Some(FileKind::Sog) => sog::decode(&bytes),
+        None if path.extension().is_some_and(|ending| ending == "splat" || ending == "ksplat") => {
+            Err(format!("is neither PLY, SPZ nor SOG; {CONVERTER}"))
+        }
         None => Err("is not a model: neither PLY, SPZ nor SOG".to_owned()),
     };
-    let (gaussians, facts) = parsed.map_err(|problem| Error::input(path, problem))?;
+    let (mut gaussians, facts) = parsed.map_err(|problem| Error::input(path, problem))?;
+    let count = gaussians.count;
+    gaussians.retain_finite();
+    warn_of_left_out(path, count, gaussians.count)?;
     warn_of(path, &facts);
     Ok((gaussians, facts))
 }
@@ -72,6 +79,19 @@ fn facts_of_run(config: &TrainConfig, model: Option<&PartFile>) -> ModelFacts {
     ModelFacts { law, ..config.facts(&config.frame.unwrap_or_default()) }
 }
 
+/// Warns if Gaussians of a file are left out; refuses it if all are.
+pub(crate) fn warn_of_left_out(path: &Path, count: usize, left: usize) -> Result<()> {
+    if left == count {
+        return Ok(());
+    }
+    let problem = format!("{} of {count} Gaussians have an infinity or NaN", count - left);
+    if left == 0 {
+        return Err(Error::input(path, format!("{problem}; export the model again")));
+    }
+    tracing::warn!("{}: {problem}, and are left out", path.display());
+    Ok(())
+}
+
 fn warn_of(path: &Path, facts: &ModelFacts) {
     if facts.near.is_none() {
         tracing::warn!("{}: does not state its near plane; the default is used", path.display());
@@ -81,5 +101,33 @@ fn warn_of(path: &Path, facts: &ModelFacts) {
         tracing::warn!(
             "{path}: its colours are linear light, raised by {stops} stops, and are shown as they are"
         );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::results::export::tests::drawn;
+
+    #[test]
+    fn files_of_other_programs_are_named_with_a_converter() {
+        let folder = tempfile::tempdir().unwrap();
+        let problem = |name: &str, bytes: &[u8]| {
+            let path = folder.path().join(name);
+            std::fs::write(&path, bytes).unwrap();
+            read(&path).unwrap_err().to_string()
+        };
+        let packed = b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nend_header\n";
+        assert!(problem("a.compressed.ply", packed).contains("splat-transform"));
+        assert!(problem("a.splat", &[0; 64]).contains("splat-transform"));
+        assert!(!problem("a.txt", &[0; 64]).contains("splat-transform"));
+        let mut model = drawn(3, 0);
+        model.dc_mut()[1].y = f32::NAN;
+        model.save(folder.path().join("a.ply")).unwrap();
+        assert_eq!(read(&folder.path().join("a.ply")).unwrap().0.count, 2);
+        model.means_mut().fill(glam::Vec3::INFINITY);
+        model.save(folder.path().join("a.ply")).unwrap();
+        let refused = read(&folder.path().join("a.ply")).unwrap_err().to_string();
+        assert!(refused.contains("3 of 3 Gaussians have an infinity or NaN"), "{refused}");
     }
 }

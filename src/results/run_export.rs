@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use glam::{DQuat, DVec3};
 
 use self::up::{Turn, Up};
-use crate::base::output::{is_same_file, own_file, write_whole};
+use crate::base::output::{create_folder_of, is_same_file, own_file, write_whole};
 use crate::photographs::dataset::Dataset;
 use crate::photographs::targets::SceneTone;
 use crate::results::export::streamed::{self, Division, TileLoader, Written};
@@ -120,6 +120,7 @@ impl ExportOptions<'_> {
         }
         let provenance = Provenance { rotation, facts, ..self.provenance(&config) };
         let mut streamed = None;
+        create_folder_of(&path)?;
         match self.format {
             // Viewers with a fixed layout expect the coefficients of degree 3.
             Format::Ply => {

@@ -2,9 +2,10 @@
 
 use serde::Serialize;
 
-use super::eval::ScoreReference;
+use super::eval::{ReferenceKind, ScoreReference};
+use crate::base::output::one_line;
 use crate::gpu::Gpu;
-use crate::photographs::dataset::{Dataset, Split};
+use crate::photographs::dataset::{Dataset, Split, View};
 use crate::photographs::tone::{Tone, ToneCurve};
 use crate::train::TrainConfig;
 use crate::train::diagnose::Plan;
@@ -17,6 +18,7 @@ pub(crate) struct RunFacts {
     /// Width and height of the first training view, pixels.
     size: [u32; 2],
     train_views: usize,
+    /// Test views with an image to score them against.
     test_views: usize,
     /// Views held out for early stopping.
     held_out_views: usize,
@@ -54,24 +56,29 @@ impl RunFacts {
             Tone::Formula(ToneCurve::None) => "",
             _ => "as requested",
         };
+        let against = ScoreReference::kind(&config.tone, dataset);
+        let is_scored = |view: &View| match against {
+            ReferenceKind::References => view.has_reference(),
+            _ => view.has_photograph(),
+        };
         Self {
             dataset: config.dataset.display().to_string(),
             device: gpu.properties().name.clone(),
             size: first.map_or([0; 2], |view| [view.camera.width, view.camera.height]),
             train_views: of(Split::Train),
-            test_views: of(Split::Test),
+            test_views: dataset.test_views().filter(|view| is_scored(view)).count(),
             held_out_views: of(Split::HeldOut),
             steps: config.steps,
             effective_cooldown_steps: config.effective_cooldown_steps(),
             notes: notes(config, dataset),
-            split: Dataset::split_rule(&config.dataset, &config.load_options()),
+            split: Dataset::split_rule(&config.dataset, &config.load_options(), of(Split::Test)),
             points: dataset.points.len(),
             curve: config.tone.curve.name().to_owned(),
             why: match planned {
                 Some(planned) if why.is_empty() => planned,
                 _ => why.to_owned(),
             },
-            against: ScoreReference::kind(&config.tone, dataset).name(),
+            against: against.name(),
         }
     }
 
@@ -91,9 +98,10 @@ impl RunFacts {
         };
         let notes: String = self.notes.iter().map(|note| format!("{note}\n")).collect();
         let tests = match self.test_views {
-            0 => "no test view".to_owned(),
+            0 => format!("0 test views ({})", self.split),
             count => format!("{count} test views ({}) scored against {}", self.split, self.against),
         };
+        let dataset = one_line(dataset);
         format!(
             "{dataset}: {train_views} views of {width}x{height} to train on; {tests}; {points} points; on {device}\n\
              {length}\n{notes}curve {}: {}\n",

@@ -129,7 +129,7 @@ pub struct TrainConfig {
     patch_pixels: Option<u64> = None, "the most that the device can bind"
         => Rule::at_least(MIN_PATCH), in "pixels", "--patch-pixels N";
     /// Use every Nth view by name as a test view, instead of the dataset's split; 0: no test views.
-    test_every: Option<usize> = None, "the dataset's split, else every 8th"
+    test_every: Option<usize> = None, "the dataset's split, else every 8th, and none of fewer than 8"
         => Rule::COUNT, in "views", "--test-every N";
     /// Patterns of photographs to leave out, by name or by path as listed: `*`, `?` and `[abc]` match. Others keep
     /// their split.

@@ -31,7 +31,7 @@ fn json_has_every_requirement_of_every_device_and_the_choice() {
 
 #[test]
 fn scheduler_variables_without_a_device_are_refused_in_one_line() {
-    for (variable, value) in [("CUDA_VISIBLE_DEVICES", "99"), ("ROCR_VISIBLE_DEVICES", "GPU-ff")] {
+    for (variable, value) in [("HIP_VISIBLE_DEVICES", "99"), ("ROCR_VISIBLE_DEVICES", "GPU-ff")] {
         let message = [&format!("{variable}={value}"), "which Vulkan does not have", "--device"];
         for command in ["doctor", "bench"] {
             refused_with(command, &[(variable, value)], 4, &message.map(|part| part as &str));

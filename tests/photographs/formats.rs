@@ -250,13 +250,13 @@ fn photographs_and_references_are_undistorted_equally() {
     };
     for (directory, gain) in [("low", 0.25), ("images", 1.0)] {
         std::fs::create_dir(root.join(directory)).unwrap();
-        for index in 0..3 {
+        for index in 0..9 {
             let path = root.join(directory).join(name(index)).with_extension("exr");
             Image::from_fn(SIZE.0, SIZE.1, pattern(gain)).save_exr(path).unwrap();
         }
     }
     let cameras = vec![(3, "OPENCV", 4, vec![35.0, 36.0, 18.0, 16.0, -0.2, 0.03, 0.002, -0.001])];
-    Model { cameras, ..model(3) }.write_text(&root.join("sparse/0"));
+    Model { cameras, ..model(9) }.write_text(&root.join("sparse/0"));
     let dataset = load(root);
     let view = &dataset.views[0];
     let (low, reference) = (view.image.as_ref().unwrap(), view.reference.as_ref().unwrap());

@@ -65,7 +65,7 @@ fn an_unsuitable_initial_model_is_refused_in_one_line_with_file_and_rule() {
     file("origin.ply", &header("element", "comment world = position + 1 2\nelement"));
     for (name, rule) in [
         ("degree.ply", "has SH degree 2, more than sh_degree, which is 1"),
-        ("ascii.ply", "of format ascii; save it as binary_little_endian"),
+        ("ascii.ply", "is truncated: 2 vertices need a line each"),
         ("big.ply", "of format binary_big_endian; save it as binary_little_endian"),
         ("points.ply", "has no property `opacity`"),
         ("origin.ply", "names the origin `1 2`, which is not three finite numbers"),

@@ -472,7 +472,7 @@ mod ply_file {
         let plain = bytes(&distinct(2, 1));
         let huge = format!("vertex {}", usize::MAX);
         for (from, to, words) in [
-            ("binary_little_endian", "ascii", ["ascii", "binary_little_endian"]),
+            ("binary_little_endian", "ascii", ["ascii", "no text"]),
             ("binary_little_endian", "binary_big_endian", ["big_endian", "binary_little_endian"]),
             ("format binary_little_endian 1.0\n", "", ["format", ""]),
             ("vertex 2", "vertex 1", ["more than", ""]),

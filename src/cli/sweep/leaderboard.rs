@@ -8,7 +8,7 @@ use super::run::Run;
 use super::runner::FailedPoint;
 use super::table::{ColumnStatistic, CsvColumn, Quantity};
 use crate::Result;
-use crate::base::output::{csv_field, write_whole};
+use crate::base::output::write_whole;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::Dataset;
 use crate::photographs::image::Image;
@@ -90,7 +90,7 @@ impl Leaderboard<'_> {
             columns.push(self.rows.csv_column(WITH_REFERENCE, cell));
         }
         if rows.iter().any(|row| row.against().is_some()) {
-            let cell = |_, row: &SweepRow| csv_field(row.against().unwrap_or_default()).to_string();
+            let cell = |_, row: &SweepRow| row.against().unwrap_or_default().to_string();
             columns.push(self.rows.csv_column(AGAINST, cell));
         }
         self.rows.csv(columns)

@@ -14,7 +14,8 @@ use anyhow::Result;
 use super::SweepArgs;
 use super::rows::{SweepResults, SweepRow, number};
 use crate::Error;
-use crate::base::output::{csv_field, printable, write_whole};
+use crate::base::csv;
+use crate::base::output::{printable, write_whole};
 use crate::cli::{finish, tell};
 use crate::networks::lpips::LpipsVersion;
 
@@ -200,9 +201,7 @@ impl SceneTable {
             for (scene, values) in named {
                 let rounded = |value: f64| (value * 1e6).round() / 1e6;
                 let numbers = values.iter().map(|value| number(value.map(rounded)));
-                let numbers: Vec<String> = numbers.collect();
-                text +=
-                    &format!("{},{},{}\n", csv_field(label), csv_field(scene), numbers.join(","));
+                text += &csv::line([label.clone(), scene.to_owned()].into_iter().chain(numbers));
             }
         }
         text

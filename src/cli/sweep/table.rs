@@ -2,7 +2,7 @@
 //! of different columns.
 
 use super::rows::{SweepResults, SweepRow, number};
-use crate::base::output::csv_field;
+use crate::base::csv;
 use crate::networks::lpips::LpipsVersion;
 use crate::results::report::{Best, Column, NumberTable};
 
@@ -130,14 +130,11 @@ impl SweepResults {
     /// A line per row: its settings, then these columns.
     pub(super) fn csv(&self, columns: Vec<CsvColumn>) -> String {
         let setting = |key: &String| {
-            self.csv_column(key, |_, row| {
-                csv_field(row.point.value(key).unwrap_or_default()).to_string()
-            })
+            self.csv_column(key, |_, row| row.point.value(key).unwrap_or_default().to_string())
         };
         let columns: Vec<CsvColumn> = self.keys.iter().map(setting).chain(columns).collect();
-        let joined = |cells: Vec<&str>| cells.join(",") + "\n";
-        let header = joined(columns.iter().map(|column| column.name.as_str()).collect());
-        let line = |row: usize| joined(columns.iter().map(|one| one.cells[row].as_str()).collect());
+        let header = csv::line(columns.iter().map(|column| column.name.as_str()));
+        let line = |row: usize| csv::line(columns.iter().map(|one| one.cells[row].as_str()));
         std::iter::once(header).chain((0..self.rows.len()).map(line)).collect()
     }
 

@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use self::page::TonePage;
 use self::photographs::{InputPhotograph, listed};
-use crate::base::output::{check_writable, create_folder, printable};
+use crate::base::output::{check_writable, create_folder, one_line};
 use crate::cli::settings::{CurveOptions, Selection, SettingOptions};
 use crate::cli::{OutputFormat, driver, finish, print, progress_bar, table, word, words};
 use crate::gpu::{DeviceChoice, Gpu};
@@ -236,7 +236,8 @@ fn text_table(output: &ToneOutput) -> String {
             score(|scores| format!("{:.3}", scores.ssim)),
         ]);
     }
-    let remarks: String = output.remarks.iter().map(|remark| format!("note: {remark}\n")).collect();
+    let remarks: String =
+        output.remarks.iter().map(|remark| format!("note: {}\n", one_line(remark))).collect();
     let reason = output.exposure.as_ref().map(|exposure| format!("{}\n", exposure.reason()));
     let label = output.with_reference.as_deref().map(eval::with_reference);
     let label = label.map(|line| line + "\n").unwrap_or_default();
@@ -261,7 +262,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     let mut views = vec![];
     let mut unusable = None;
     for photograph in &photographs {
-        progress.set_message(printable(&photograph.name).into_owned());
+        progress.set_message(one_line(&photograph.name).into_owned());
         match mapped(&mut set, photograph) {
             Ok(mapped) => {
                 if let Some(target) = &photograph.target {

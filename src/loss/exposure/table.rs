@@ -11,8 +11,8 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use super::Affine;
-use crate::base::input;
 use crate::base::output::write_whole;
+use crate::base::{csv, input};
 use crate::photographs::image::files::stem;
 use crate::photographs::image::{MIDDLE_GREY, linear_from_srgb, srgb_from_linear};
 use crate::{Error, Result};
@@ -49,8 +49,7 @@ pub fn save(path: &Path, exposures: &[(String, Affine)]) -> Result<()> {
     let mut text = COLUMNS.join(",") + "\n";
     for (name, affine) in exposures {
         let Affine { gain: [r, g, b], bias } = affine;
-        let name = name.replace(char::is_control, "_");
-        text += &format!("{name},{:.3},{r},{g},{b},", affine.stops());
+        text += &format!("{},{:.3},{r},{g},{b},", csv::field(name), affine.stops());
         text += &format!("{},{},{}\n", bias[0], bias[1], bias[2]);
     }
     write_whole(path, text.as_bytes())
@@ -81,10 +80,10 @@ pub fn load(path: &Path) -> Result<Vec<KnownExposure>> {
     Ok(rows)
 }
 
-/// Parses a line; a name may contain commas.
+/// Parses a line.
 fn parsed(columns: &[&str], line: &str) -> Result<KnownExposure, String> {
-    let mut cells: Vec<&str> = line.rsplitn(columns.len(), ',').map(str::trim).collect();
-    cells.reverse();
+    let cells = csv::cells_of(line, columns.len());
+    let cells: Vec<&str> = cells.iter().map(|cell| cell.trim()).collect();
     if cells.len() != columns.len() {
         return Err(format!("`{line}` has {} cells, not {}", cells.len(), columns.len()));
     }
@@ -132,7 +131,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("exposures.csv");
         let affine = Affine { gain: [0.7, 1.0 / 3.0, 2.5], bias: [0.125, -1e-7, 0.0] };
-        let exposures = [("a, b".to_owned(), affine), ("c".to_owned(), Affine::IDENTITY)];
+        let exposures = [("a, \"b\"".to_owned(), affine), ("=c".to_owned(), Affine::IDENTITY)];
         save(&path, &exposures).unwrap();
         let read_rows = load(&path).unwrap();
         for ((name, affine), read_rows) in exposures.iter().zip(&read_rows) {

@@ -38,6 +38,9 @@ const BLOCK: usize = 8;
 /// How far interpolation spreads black, pixels.
 const REACH: usize = 2;
 
+/// A border of more of an image is a scene that is black.
+const MOST_AREA: f64 = 0.9;
+
 /// The pixels that show nothing, as indices into a plane, ascending; by width and height of the photographs as stored.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Borders(BTreeMap<(u32, u32), Vec<usize>>);
@@ -201,7 +204,7 @@ fn border<'a>(
     let most = (MAX_VIEWS * views as f64).ceil() as u16;
     let is_common = |pixel: usize| counts[pixel] >= most;
     let common: Vec<usize> = (0..plane.len()).filter(|&pixel| is_common(pixel)).collect();
-    if common.len() < least || common.len() == plane.len() {
+    if common.len() < least || common.len() as f64 > MOST_AREA * plane.len() as f64 {
         return None;
     }
     areas.sort_unstable();
@@ -366,6 +369,7 @@ mod tests {
         let fade = |_: u32, y: u32| 0.0005 * y as f32;
         assert_eq!(border(views(0, fade, 100.0), SIZE), None, "a sky that fades");
         assert_eq!(border(views(0, |_, _| 0.0, 100.0), SIZE), None, "all black");
+        assert_eq!(border(views(0, |_, _| 1.0, 1.0), SIZE), None, "some lit pixels");
         assert_eq!(border(views(3, textured, 30.0).take(2), SIZE), None, "two views tell nothing");
         let one = views(3, textured, 30.0).take(1).chain(views(3, textured, 100.0));
         assert_eq!(border(one, SIZE), None, "in one view only");

@@ -101,11 +101,28 @@ enum ColmapFile {
     Text(PathBuf),
 }
 
+/// A file of a model; one whose name differs in case, such as `Cameras.txt`, where there is no other.
 fn file(folder: &Path, stem: &str) -> Option<ColmapFile> {
-    let path = |extension| {
+    let exact = |extension| {
         Some(folder.join(stem).with_extension(extension)).filter(|path| tree::is_file(path))
     };
-    path("bin").map(ColmapFile::Binary).or_else(|| path("txt").map(ColmapFile::Text))
+    if let Some(path) = exact("bin") {
+        return Some(ColmapFile::Binary(path));
+    }
+    if let Some(path) = exact("txt") {
+        return Some(ColmapFile::Text(path));
+    }
+    let mut paths = tree::entries(folder).ok()?;
+    paths.sort();
+    let alike = |extension: &str| {
+        let name = format!("{stem}.{extension}");
+        let is_alike = |path: &&PathBuf| {
+            path.file_name().is_some_and(|other| other.eq_ignore_ascii_case(&name))
+                && tree::is_file(path)
+        };
+        paths.iter().find(is_alike).cloned()
+    };
+    alike("bin").map(ColmapFile::Binary).or_else(|| alike("txt").map(ColmapFile::Text))
 }
 
 fn required(folder: &Path, stem: &str) -> Result<ColmapFile> {

@@ -29,7 +29,7 @@ pub(super) fn find(root: &Path, frame: &ViewEntry, files: &PhotographFiles) -> O
 fn moving(photograph: &Path, files: &PhotographFiles) -> Option<MaskFile> {
     let name = photograph.file_name()?.to_str()?;
     let path = files.find(photograph.parent()?, &format!("{MOVING}{name}"))?;
-    Some(MaskFile { path, is_inverted: true })
+    Some(MaskFile { is_inverted: true, ..MaskFile::shown(path) })
 }
 
 /// The mask beside a photograph that no listing names.

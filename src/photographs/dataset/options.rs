@@ -22,7 +22,7 @@ pub struct LoadOptions {
     /// limit.
     pub max_resolution: u32,
     /// Every Nth view by name is held out, instead of the dataset's split; 0: none. `None`: the dataset's own split,
-    /// else every eighth.
+    /// else every eighth, and none of fewer than eight photographs.
     pub test_every: Option<usize>,
     /// Patterns of the names of photographs that are left out; the others keep their split.
     pub exclude: Vec<String>,

@@ -23,7 +23,7 @@ use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
 use crate::camera::{Camera, Lens};
-use crate::photographs::image::{ColourCounts, Image, Levels, Mask, PictureFile};
+use crate::photographs::image::{ColourCounts, Image, Levels, Mask, MaskFile, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
 use crate::photographs::white_balance::WhiteBalanceMatrix;
 use crate::{Error, Result};
@@ -94,12 +94,15 @@ fn load_with(
     let points = || points::of_sources(layout, &sources);
     let pixels = tracked::pixels(&sources, &of_photographs, options.orientation, points)?;
     let fitted = sources.into_par_iter().zip(headers).map(|(mut source, headers)| {
+        let listed = source.lens;
         source.fit(headers, pixels)?;
-        Ok(source)
+        Ok((listed, source))
     });
+    let fitted = fitted.collect::<Result<Vec<_>>>()?;
+    say_of_patches(&fitted);
     let mut groups: Vec<(Lens, Vec<ViewFiles>)> = Vec::new();
     let mut indices = HashMap::new();
-    for source in fitted.collect::<Result<Vec<_>>>()? {
+    for (_, source) in fitted {
         // The Debug output distinguishes all lenses.
         let index = *indices.entry(format!("{:?}", source.lens)).or_insert(groups.len());
         match groups.get_mut(index) {
@@ -141,6 +144,21 @@ fn load_with(
         skipped.extend(problems);
     }
     Ok(Some(views))
+}
+
+/// Says where cameras are of a network's input, from their listed lenses.
+fn say_of_patches(fitted: &[(Lens, ViewFiles)]) {
+    let is_of_patches = |(listed, source): &&(Lens, ViewFiles)| {
+        listed.fitted(source.lens.width, source.lens.height).is_none()
+    };
+    let count = fitted.iter().filter(is_of_patches).count();
+    if let Some((listed, ViewFiles { name, lens, .. })) = fitted.iter().find(is_of_patches) {
+        let [from, to] = [listed, lens].map(|lens| format!("{}x{}", lens.width, lens.height));
+        tracing::warn!(
+            "{count} cameras are of a network's input, rounded to 14 pixels each way ({name}: {from}, the photograph \
+             {to}): scaled for each axis"
+        );
+    }
 }
 
 /// What loading the views has in common.
@@ -223,8 +241,8 @@ impl ViewFiles {
         let mut sized = [&self.input, &self.reference].into_iter().zip(sizes);
         let sized = sized.find_map(|(path, size)| Some((path.as_deref()?, size?)));
         let Some((path, (width, height))) = sized else { return Ok(()) };
-        self.lens =
-            lens.fitted(width, height).ok_or_else(|| disagreement(path, (width, height), &lens))?;
+        let fitted = lens.fitted(width, height).or_else(|| lens.fitted_from_patches(width, height));
+        self.lens = fitted.ok_or_else(|| disagreement(path, (width, height), &lens))?;
         if (width, height) != (lens.width, lens.height) {
             tracing::info!(
                 "{}: is {width}x{height}, its camera {}x{}; intrinsics rescaled",
@@ -320,7 +338,7 @@ impl ViewLoader<'_> {
             view_from_world,
             input,
             reference,
-            mask,
+            mask: mask_file,
             depth,
             read,
             turns,
@@ -337,10 +355,16 @@ impl ViewLoader<'_> {
             self.decode(reference, read_reference, turns[1], reference_colours, &mut problems)?;
         let picture = photograph.as_ref().or(reference.as_ref());
         let orientation = picture.map(|picture| picture.turns.viewing).unwrap_or_default();
+        let mut file_that_hides = None;
         let stored_mask = match picture {
             Some(DecodedPicture { path, image, alpha, turns, .. }) => {
                 let decoded = (image, alpha.as_ref());
-                let stored = Mask::over(path, decoded, mask.as_ref(), options.invert_masks)?;
+                let stored = Mask::over(path, decoded, mask_file.as_ref(), options.invert_masks)?;
+                let hides = |mask: &&MaskFile| {
+                    let is_all = alpha.is_none() && stored.as_ref().is_some_and(Mask::hides_all);
+                    is_all && mask.is_inverted == options.invert_masks
+                };
+                file_that_hides = mask_file.as_ref().filter(hides);
                 let stored = loading.borders.hide_borders(stored, (image.width, image.height));
                 stored.map(|stored| (stored, path.clone(), turns.loading))
             }
@@ -361,7 +385,13 @@ impl ViewLoader<'_> {
         });
         let is_hidden = mask.as_ref().is_some_and(Mask::hides_all);
         if is_hidden {
-            problems.push(format!("{name}: no pixel is a number that its mask shows"));
+            problems.push(match file_that_hides {
+                Some(MaskFile { path, .. }) => {
+                    let path = path.display();
+                    format!("{name}: {path}: the mask is black everywhere; white pixels count")
+                }
+                None => format!("{name}: no pixel is a number that its mask shows"),
+            });
         }
         let photograph = photograph
             .filter(|_| !is_hidden)

@@ -207,8 +207,14 @@ pub(super) fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens
     } else {
         format!(" (upright {seen_width}x{seen_height})")
     };
+    let padded = if lens.is_of_patches() {
+        ", or take back in the cameras how a network (VGGT) padded or cropped them"
+    } else {
+        ""
+    };
     let problem = format!(
-        "is {width}x{height}{seen} but its camera is {w}x{h}; use the photographs that the cameras were made with"
+        "is {width}x{height}{seen} but its camera is {w}x{h}; use the photographs that the cameras were made \
+         with{padded}"
     );
     Error::input(path, problem)
 }

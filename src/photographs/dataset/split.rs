@@ -9,7 +9,7 @@ use crate::Result;
 use crate::base::{input, tree};
 use crate::photographs::image::files::PhotographFiles;
 
-/// Every eighth of the name-sorted views is held out by default.
+/// Every eighth of the name-sorted views is held out by default, and none of fewer.
 pub(super) const TEST_EVERY: usize = 8;
 
 /// The list of test photographs, next to the photographs or in the model, as in 3DGS.
@@ -19,7 +19,8 @@ pub(super) fn test_list(root: &Path) -> Option<PathBuf> {
 }
 
 /// Assigns the frames, sorted by name, that the listing did not assign: by `test.txt` (a name per line), else every
-/// eighth. With `test_every`, every Nth instead of any other rule; 0: none.
+/// eighth of those that have a photograph, if they are eight or more. With `test_every`, every Nth instead of any other
+/// rule; 0: none.
 pub(super) fn split(
     root: &Path,
     frames: &mut [ViewEntry],
@@ -34,8 +35,13 @@ pub(super) fn split(
     let mut undecided: Vec<&mut ViewEntry> =
         frames.iter_mut().filter(|frame| frame.split.is_none()).collect();
     let Some(path) = list.filter(|_| !undecided.is_empty()) else {
-        for (index, frame) in undecided.into_iter().enumerate() {
-            frame.split = Some(if index % TEST_EVERY == 0 { Split::Test } else { Split::Train });
+        let is_shown = |frame: &ViewEntry| frame.input(root, true, files).is_some();
+        let shown = undecided.iter().filter(|frame| is_shown(frame)).count();
+        let mut index = 0;
+        for frame in undecided {
+            let is_test = shown >= TEST_EVERY && is_shown(frame) && index % TEST_EVERY == 0;
+            index += usize::from(is_shown(frame));
+            frame.split = Some(if is_test { Split::Test } else { Split::Train });
         }
         return Ok(());
     };
@@ -79,8 +85,8 @@ pub(super) fn log_split(root: &Path, has_split: bool, options: &LoadOptions) {
     }
 }
 
-/// Holds out every Nth view by name instead of the dataset's own split. A listed test view without a dark photograph
-/// cannot be trained on: it stays a pose.
+/// Holds out every Nth view by name that has a photograph, instead of the dataset's own split. A listed test view
+/// without a dark photograph cannot be trained on: it stays a pose.
 fn split_anew(root: &Path, frames: &mut [ViewEntry], every: usize, files: &PhotographFiles) {
     let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
     let training_folders: BTreeSet<String> =
@@ -89,12 +95,12 @@ fn split_anew(root: &Path, frames: &mut [ViewEntry], every: usize, files: &Photo
     for frame in frames {
         let lists_input =
             frame.split != Some(Split::Test) || training_folders.contains(frame.folder());
-        let is_posed_only =
-            frame.split == Some(Split::Test) && frame.input(root, lists_input, files).is_none();
-        if !is_posed_only {
-            let is_test = every > 0 && index % every == 0;
-            frame.split = Some(if is_test { Split::Test } else { Split::Train });
-            index += 1;
+        if frame.input(root, lists_input, files).is_none() {
+            frame.split = frame.split.or(Some(Split::Train));
+            continue;
         }
+        let is_test = every > 0 && index % every == 0;
+        frame.split = Some(if is_test { Split::Test } else { Split::Train });
+        index += 1;
     }
 }

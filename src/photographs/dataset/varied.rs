@@ -14,6 +14,7 @@ use std::fs;
 use std::path::Path;
 
 use super::{Dataset, Split, View};
+use crate::base::csv;
 use crate::base::output::write_whole;
 use crate::base::random::Stream;
 use crate::camera::{Camera, CameraModel};
@@ -107,7 +108,8 @@ pub fn write(dir: &Path, dataset: &Dataset, variation: &Variation) -> Result<usi
         let (name, varied) = (file_name(view), variation.of_photograph(index));
         image.save_png8(dir.join(CLEAN).join(&name))?;
         varied.applied(&image).save_png8(dir.join(VARIED).join(&name))?;
-        let _ = writeln!(table, "{},{:.6},{:.6}", view.name, varied.stops, varied.gamma);
+        let numbers = [varied.stops, varied.gamma].map(|number| format!("{number:.6}"));
+        table += &csv::line([&view.name, &numbers[0], &numbers[1]]);
         if view.split == Split::Test {
             let _ = writeln!(tests, "{name}");
         }

@@ -24,12 +24,37 @@ pub(crate) struct MaskFile {
     pub(crate) path: PathBuf,
     /// White pixels are masked, instead of black ones.
     pub(crate) is_inverted: bool,
+    /// It has labels: what is not 0 is white.
+    pub(crate) is_of_labels: bool,
 }
 
 impl MaskFile {
     /// A mask whose white pixels count.
     pub(crate) fn shown(path: PathBuf) -> Self {
-        Self { path, is_inverted: false }
+        Self { path, is_inverted: false, is_of_labels: false }
+    }
+
+    /// Marks masks whose largest value, of all of them, is 1 as labels, with a remark on it. Reads masks up to the
+    /// first with a larger value; those that cannot be read are reported when they are used.
+    pub(crate) fn find_labels<'a>(masks: impl Iterator<Item = &'a mut Self>) -> Option<String> {
+        let mut masks: Vec<&mut Self> = masks.collect();
+        let mut has_label = false;
+        for mask in &masks {
+            let Ok(image) = Image::load_as_stored(&mask.path) else { continue };
+            let most = image.data[..image.pixel_count()].iter().copied().fold(0.0, f32::max);
+            // 1 of 8 bits, or of 16.
+            match (65_535.0 * most).round() as u32 {
+                0 => {}
+                1 | 257 => has_label = true,
+                _ => return None,
+            }
+        }
+        let first = masks.first().filter(|_| has_label)?.path.display();
+        let remark = format!(
+            "{first} and all other masks have no value above 1: they are labels, of which 1 shows"
+        );
+        masks.iter_mut().for_each(|mask| mask.is_of_labels = true);
+        Some(remark)
     }
 }
 
@@ -65,7 +90,7 @@ impl Mask {
         file: Option<&MaskFile>,
         inverted: bool,
     ) -> Result<Option<Self>> {
-        let Some(MaskFile { path: file, is_inverted }) = file else {
+        let Some(MaskFile { path: file, is_inverted, is_of_labels }) = file else {
             return Ok(alpha.and_then(Self::of_plane));
         };
         let inverted = inverted != *is_inverted;
@@ -89,6 +114,9 @@ impl Mask {
                 )
             };
             return Err(Error::input(file, problem));
+        }
+        if *is_of_labels {
+            mask.data.iter_mut().for_each(|value| *value = f32::from(*value > 0.0));
         }
         mask = mask.resized(size.0, size.1);
         let pixels = mask.pixel_count();
@@ -199,6 +227,28 @@ mod tests {
         assert!(!half().hides_all());
         let hides = |x: f64| half().hides_around(glam::DVec2::new(x, 1.5));
         assert_eq!([0.0, 1.4, 1.6, 3.9].map(hides), [false, false, true, true]);
+    }
+
+    #[test]
+    fn masks_without_a_value_above_1_are_labels() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |name: &str, value: f32| {
+            let path = folder.path().join(name);
+            let image = Image::from_fn(4, 2, |x, _| [if x < 2 { value / 255.0 } else { 0.0 }; 3]);
+            image.save_png8(&path).unwrap();
+            MaskFile::shown(path)
+        };
+        let photograph = folder.path().join("photograph.png");
+        Image::filled(8, 4, [0.1; 3]).save_png8(&photograph).unwrap();
+        let picture = Image::load_as_stored(&photograph).unwrap();
+        let shown = |masks: &mut [MaskFile]| {
+            MaskFile::find_labels(masks.iter_mut());
+            let mask = Mask::over(&photograph, (&picture, None), Some(&masks[1]), false);
+            8 * 4 - mask.unwrap().unwrap().hidden().len()
+        };
+        assert_eq!(shown(&mut [file("0.png", 0.0), file("1.png", 1.0)]), 16);
+        assert_eq!(shown(&mut [file("0.png", 255.0), file("1.png", 1.0)]), 0);
+        assert_eq!(shown(&mut [file("0.png", 2.0), file("1.png", 1.0)]), 0);
     }
 
     #[test]

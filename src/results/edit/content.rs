@@ -32,7 +32,11 @@ impl Content {
     /// Opens a run or a model file.
     pub(super) fn open(path: &Path) -> Result<(Self, ModelFacts)> {
         if let Some((file, facts)) = models::open_parts(path, PART)? {
-            return Ok((Self::of_parts(file), facts));
+            let count = file.count();
+            let mut content = Self::of_parts(file);
+            content.apply(Step::Finite)?;
+            models::warn_of_left_out(path, count, content.count)?;
+            return Ok((content, facts));
         }
         let (gaussians, facts) = models::read(path)?;
         Ok((Self::of_whole(gaussians), facts))
@@ -197,6 +201,15 @@ mod tests {
             let [a, b] = ["whole.ply", "parts.ply"].map(|name| std::fs::read(path(name)).unwrap());
             assert!(a == b, "parts of {part}");
         }
+        // One that is not finite is left out, read in parts or whole.
+        let mut broken = model.clone();
+        broken.raw_opacities_mut()[70] = f32::NEG_INFINITY;
+        broken.save(path("broken.ply")).unwrap();
+        let (content, _) = Content::open(&path("broken.ply")).unwrap();
+        let (read, _) = models::read(&path("broken.ply")).unwrap();
+        assert_eq!((content.count(), content.whole().unwrap().into_owned()), (99, read.clone()));
+        assert_eq!(content.fingerprint().unwrap(), fingerprint(&read));
+        assert_eq!(read.means()[70], model.means()[71]);
         whole.apply(Step::OpacityMin(0.9999)).unwrap();
         assert_eq!(whole.count(), 0);
     }

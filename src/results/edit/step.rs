@@ -14,6 +14,8 @@ pub(super) enum Step {
     /// Removes Gaussians by their numbers in the model; the spans are in order and do not overlap.
     Delete(Vec<(usize, usize)>),
     OpacityMin(f64),
+    /// Removes Gaussians that have an infinity or NaN.
+    Finite,
     ShDegree(u32),
     Rotate(DQuat),
     Scale(f64),
@@ -45,7 +47,7 @@ impl Step {
 
     /// Whether it may remove Gaussians.
     pub(super) fn removes(&self) -> bool {
-        matches!(self, Self::Crop(_) | Self::Delete(_) | Self::OpacityMin(_))
+        matches!(self, Self::Crop(_) | Self::Delete(_) | Self::OpacityMin(_) | Self::Finite)
     }
 
     /// Changes a part of a model whose first Gaussian has the number `first`.
@@ -70,6 +72,7 @@ impl Step {
                 let keep: Vec<bool> = part.opacities().map(|opacity| opacity >= *least).collect();
                 part.retain(&keep);
             }
+            Self::Finite => part.retain_finite(),
             Self::ShDegree(degree) => *part = part.with_sh_degree(*degree),
             Self::Rotate(rotation) => part.rotate(*rotation),
             Self::Scale(factor) => part.scale(*factor),

@@ -3,9 +3,11 @@
 //! The axes are OpenGL's, and the coefficients are rotated with them: not every reader rotates coefficients with a
 //! node.
 
+use glam::Vec3;
 use serde_json::{Map, Value, json};
 
 use super::{GENERATOR, Provenance, half_turn, sigmoid, unit};
+use crate::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
 use crate::photographs::image::linear_from_srgb;
 use crate::splats::scene::{Gaussians, SH_C0, rest_coefficients};
 use crate::{Error, Result};
@@ -20,9 +22,9 @@ struct GlbAttribute {
     values: Vec<f32>,
 }
 
-/// Encodes a model.
+/// Encodes a model. Scales are clamped, with a warning, as in training: glTF has no infinities.
 pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>> {
-    let gaussians = half_turn(gaussians);
+    let gaussians = clamped(half_turn(gaussians));
     let planes = planes(&gaussians, provenance.facts.linear.is_some());
     let json = description(&gaussians, &planes, provenance).to_string();
     let body: usize = planes.iter().map(|plane| 4 * plane.values.len()).sum();
@@ -45,13 +47,30 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
     Ok(file)
 }
 
+/// The Gaussians with scales as training clamps them; warns where that changes one.
+fn clamped(mut gaussians: Gaussians) -> Gaussians {
+    let mut count = 0;
+    let [least, most] = [LOG_SCALE_MIN, LOG_SCALE_MAX].map(|bound| bound as f32);
+    for scale in gaussians.log_scales_mut() {
+        let within = scale.clamp(Vec3::splat(least), Vec3::splat(most));
+        count += usize::from(within != *scale);
+        *scale = within;
+    }
+    if count > 0 {
+        tracing::warn!(
+            "{count} Gaussians have scales beyond exp({least}) to exp({most}), which are clamped"
+        );
+    }
+    gaussians
+}
+
 fn planes(gaussians: &Gaussians, are_linear: bool) -> Vec<GlbAttribute> {
     let plane = |name: &str, kind, values| GlbAttribute {
         name: format!("{EXTENSION}:{name}"),
         kind,
         values,
     };
-    let floats = |vectors: &[glam::Vec3]| bytemuck::cast_slice::<_, f32>(vectors).to_vec();
+    let floats = |vectors: &[Vec3]| bytemuck::cast_slice::<_, f32>(vectors).to_vec();
     let opacity: Vec<f32> = gaussians.raw_opacities().iter().map(|&raw| sigmoid(raw)).collect();
     let rotation =
         gaussians.quats().iter().map(|&quat| unit(quat)).flat_map(|[w, x, y, z]| [x, y, z, w]);
@@ -140,6 +159,17 @@ fn description(gaussians: &Gaussians, planes: &[GlbAttribute], provenance: &Prov
 mod tests {
     use super::*;
     use crate::results::export::tests::drawn;
+
+    #[test]
+    fn scales_are_finite() {
+        let mut model = drawn(2, 0);
+        model.log_scales_mut()[1] = Vec3::new(1e30, -1e30, 0.5);
+        let scales = &planes(&clamped(model), false)[3].values;
+        assert_eq!(
+            scales[3..],
+            [LOG_SCALE_MAX, LOG_SCALE_MIN, 0.5].map(|scale| (scale as f32).exp())
+        );
+    }
 
     #[test]
     fn every_attribute_is_at_the_stated_place() {

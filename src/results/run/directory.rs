@@ -33,7 +33,8 @@ use super::ledger;
 use super::lock::RunLock;
 pub use super::progress::Progress;
 use super::tensorboard::EventFile;
-use crate::base::output::{csv_field, flush_to_disk, own_file, write_whole};
+use crate::base::csv;
+use crate::base::output::{flush_to_disk, own_file, write_whole};
 use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::loss::exposure::{Affine, table};
@@ -206,8 +207,7 @@ impl RunDirectory {
 
     /// Writes the list of views, to detect that a dataset has changed.
     pub fn save_views(&self, dataset: &Dataset) -> Result<()> {
-        let lines: String = view_lines(dataset).into_iter().map(|line| line + "\n").collect();
-        let text = format!("name,split,width,height\n{lines}");
+        let text = format!("name,split,width,height\n{}", view_lines(dataset).concat());
         write_whole(&self.own_file(VIEWS)?, text.as_bytes())
     }
 
@@ -267,7 +267,7 @@ impl RunDirectory {
         let StepReport { step, view, loss, gaussians, milliseconds, .. } = report;
         let terms: String =
             self.terms.iter().map(|&term| format!("{:.6},", report.term(term))).collect();
-        let view = csv_field(view);
+        let view = csv::field(view);
         self.log_line(&format!("{step},{view},{loss:.6},{terms}{gaussians},{milliseconds:.2}"))
     }
 
@@ -317,7 +317,7 @@ pub fn load_progress(run: &Path) -> Vec<Progress> {
     text.lines().filter_map(Progress::parse).collect()
 }
 
-/// A line for every view.
+/// A line for every view, with its line break.
 pub(super) fn view_lines(dataset: &Dataset) -> Vec<String> {
     let line = |view: &View| {
         let split = match view.split {
@@ -325,7 +325,8 @@ pub(super) fn view_lines(dataset: &Dataset) -> Vec<String> {
             Split::Test => "test",
             Split::HeldOut => "held_out",
         };
-        format!("{},{split},{},{}", view.name, view.camera.width, view.camera.height)
+        let size = [view.camera.width, view.camera.height].map(|length| length.to_string());
+        csv::line([&view.name, split, &size[0], &size[1]])
     };
     dataset.views.iter().map(line).collect()
 }
@@ -363,8 +364,11 @@ fn remove_events(run: &Path) -> Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use glam::DAffine3;
+
     use super::*;
-    use crate::results::run::{load_config, load_gaussians};
+    use crate::camera::Camera;
+    use crate::results::run::{load_config, load_gaussians, other_views};
 
     fn create(path: &Path, config: &TrainConfig, overwrite: bool) -> Result<RunDirectory> {
         RunDirectory::check(path, overwrite)?;
@@ -382,6 +386,34 @@ mod tests {
         drop(create(folder.path(), &config, true).unwrap());
         assert!(folder.path().join("notes.txt").exists());
         assert_eq!(load_config(folder.path()).unwrap(), config);
+    }
+
+    #[test]
+    fn views_of_any_name_are_a_field_each_and_recognised_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = create(folder.path(), &TrainConfig::default(), false).unwrap();
+        let view = |name| {
+            View::new(
+                name,
+                Split::Train,
+                Camera::perspective(DAffine3::IDENTITY, 1.0, [8, 4]),
+                None,
+            )
+        };
+        let views = ["a,b \"c\"", "=1+1", "two\nlines"].map(view).to_vec();
+        let dataset = Dataset { root: "set".into(), views, points: vec![], skipped: vec![] };
+        run.save_views(&dataset).unwrap();
+        let text = std::fs::read_to_string(folder.path().join(VIEWS)).unwrap();
+        let lines = ["\"a,b \"\"c\"\"\",train,8,4", "'=1+1,train,8,4", "two\\nlines,train,8,4"];
+        assert_eq!(text.lines().skip(1).collect::<Vec<_>>(), lines);
+        assert_eq!(other_views(folder.path(), &dataset), None);
+        // As runs before quoted none.
+        std::fs::write(
+            folder.path().join(VIEWS),
+            "name,split,width,height\na,b \"c\",train,8,4\n=1+1,train,8,4\ntwo\\nlines,train,8,4\n",
+        )
+        .unwrap();
+        assert_eq!(other_views(folder.path(), &dataset), None);
     }
 
     #[test]

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use super::directory::view_lines;
 use super::files::{EXPOSURES, LAMP, NETWORKS, PLAN, TARGET_EXPOSURE, VIEWS};
 use super::generations;
-use crate::base::input;
+use crate::base::{csv, input};
 use crate::gpu::Gpu;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::Dataset;
@@ -150,11 +150,11 @@ pub fn load_exposures(run: &Path) -> Result<BTreeMap<String, Affine>> {
 /// no list of views.
 pub fn other_views(run: &Path, dataset: &Dataset) -> Option<String> {
     let text = std::fs::read_to_string(run.join(VIEWS)).ok()?;
-    let views: BTreeSet<&str> = text.lines().skip(1).collect();
-    let lines = view_lines(dataset);
-    let others: BTreeSet<&str> = lines.iter().map(String::as_str).collect();
+    let views: BTreeSet<String> =
+        text.lines().skip(1).map(|line| csv::line(csv::cells_of(line, 4))).collect();
+    let others: BTreeSet<String> = view_lines(dataset).into_iter().collect();
     let [gone, new] = [views.difference(&others), others.difference(&views)].map(|lines| {
-        let lines: Vec<&str> = lines.copied().collect();
+        let lines: Vec<&str> = lines.map(|line| line.trim_end()).collect();
         lines.first().map(|first| format!("{} (the first: {first})", lines.len()))
     });
     match (gone, new) {

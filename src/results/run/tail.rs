@@ -10,6 +10,7 @@ use serde::Serialize;
 use super::files::{ENDED, HELD_OUT, LOG};
 use super::load::{is_finished, load_config, load_metrics};
 use super::lock::RunLock;
+use crate::base::csv;
 
 /// The state of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -120,19 +121,13 @@ struct RunLogRow {
 }
 
 impl RunLogRow {
-    /// Parses a whole line of the log: step, view, loss, the terms, Gaussians, milliseconds. The view may be quoted and
-    /// contain commas.
+    /// Parses a whole line of the log: step, view, loss, the terms, Gaussians, milliseconds.
     fn parse(line: &str) -> Option<Self> {
-        let (step, rest) = line.split_once(',')?;
-        let after_view = match rest.strip_prefix('"') {
-            Some(quoted) => quoted.rsplit_once("\",")?.1,
-            None => rest.split_once(',')?.1,
-        };
-        let numbers: Vec<&str> = after_view.split(',').collect();
-        let [gaussians, milliseconds] = *numbers.last_chunk()?;
+        let cells = csv::cells(line);
+        let [gaussians, milliseconds] = cells.last_chunk()?;
         Some(Self {
-            step: step.parse().ok()?,
-            loss: numbers.first()?.parse().ok()?,
+            step: cells[0].parse().ok()?,
+            loss: cells.get(2)?.parse().ok()?,
             gaussians: gaussians.parse().ok()?,
             milliseconds: milliseconds.parse().ok()?,
         })

@@ -32,6 +32,19 @@ impl Gaussians {
         }
     }
 
+    /// Removes the Gaussians that have an infinity or NaN.
+    pub(crate) fn retain_finite(&mut self) {
+        let mut keep = vec![true; self.count];
+        for spec in &ATTRIBUTES {
+            let plane = &self.parameters[self.plane(spec.attribute)];
+            let rows = plane.chunks_exact(self.columns(spec.attribute).width.max(1));
+            for (keep, row) in keep.iter_mut().zip(rows) {
+                *keep &= row.iter().all(|value| value.is_finite());
+            }
+        }
+        self.retain(&keep);
+    }
+
     /// Removes the Gaussians whose `keep` is false; the others keep their order.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn retain(&mut self, keep: &[bool]) {

@@ -1,6 +1,7 @@
 //! Gaussians as a PLY file in the INRIA layout, which splat viewers open.
 //!
-//! Binary little-endian, one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`.
+//! Binary little-endian, as written, or text, with one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity
+//! scale_0..2 rot_0..3`.
 //! Positions far from the world's origin are relative to another origin, given in a comment: `world = position + X Y
 //! Z`. Other comments state the settings of a renderer, such as `nightsplat near 0.1`: [`ModelFacts`]. Features, if
 //! any, are between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`, which viewers skip.
@@ -9,7 +10,9 @@
 
 #[cfg(feature = "io")]
 pub(crate) mod parts;
+mod text;
 
+use std::borrow::Cow;
 use std::fs;
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
@@ -171,7 +174,7 @@ impl Writer {
     }
 }
 
-/// Reads Gaussians from a binary little-endian PLY; unknown properties are skipped.
+/// Reads Gaussians from a PLY, binary little-endian or text; unknown properties are skipped.
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
     let bytes = input::bytes(path)?;
@@ -179,12 +182,31 @@ pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     Ok(gaussians)
 }
 
-/// The Gaussians of a file, and the facts that it states.
+/// The Gaussians of a file, all finite, and the facts that it states.
 pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, ModelFacts), String> {
-    let header = PlyHeader::parse(bytes)?;
-    let body = &bytes[header.length..];
+    let (gaussians, facts) = parse_any(bytes)?;
+    for property in properties(gaussians.shape) {
+        let (begin, stride) = property.address(&gaussians);
+        let values = gaussians.parameters.iter().skip(begin).step_by(stride);
+        let mut values = values.take(gaussians.count);
+        if let Some(vertex) = values.position(|value| !value.is_finite()) {
+            let (name, value) = (property.name, gaussians.parameters[begin + stride * vertex]);
+            return Err(format!("vertex {vertex}: `{name}` is {value}, not a finite number"));
+        }
+    }
+    Ok((gaussians, facts))
+}
+
+/// As [`parse`]; numbers may be infinite or NaN.
+pub(crate) fn parse_any(bytes: &[u8]) -> Result<(Gaussians, ModelFacts), String> {
+    let mut header = PlyHeader::parse(bytes)?;
+    let mut body = Cow::Borrowed(&bytes[header.length..]);
+    if header.encoding == PlyEncoding::Text {
+        body = text::vertices(&header, &body)?.into();
+        (header.encoding, header.has_more) = (PlyEncoding::Little, false);
+    }
     let layout = PlyLayout::new(&header, body.len() as u64)?;
-    Ok((layout.gaussians(&body[..layout.count * layout.stride], 0)?, layout.facts))
+    Ok((layout.gaussians(&body[..layout.count * layout.stride]), layout.facts))
 }
 
 /// Where the numbers of Gaussians are in the vertices of a file.
@@ -236,8 +258,8 @@ impl PlyLayout {
         })
     }
 
-    /// The Gaussians of some vertices, of which the first has the number `first`.
-    fn gaussians(&self, vertices: &[u8], first: usize) -> Result<Gaussians, String> {
+    /// The Gaussians of some vertices.
+    fn gaussians(&self, vertices: &[u8]) -> Gaussians {
         // Every vertex has bytes, since `of` requires properties.
         let mut gaussians = Gaussians::zeros(vertices.len() / self.stride, self.shape);
         gaussians.origin = self.facts.origin;
@@ -245,18 +267,10 @@ impl PlyLayout {
             let (begin, stride) = property.address(&gaussians);
             for (gaussian, vertex) in vertices.chunks_exact(self.stride).enumerate() {
                 let [a, b, c, d] = [0, 1, 2, 3].map(|byte| vertex[offset + byte]);
-                let value = f32::from_le_bytes([a, b, c, d]);
-                if !value.is_finite() {
-                    return Err(format!(
-                        "vertex {}: `{}` is {value}, not a finite number",
-                        first + gaussian,
-                        property.name
-                    ));
-                }
-                gaussians.parameters[begin + stride * gaussian] = value;
+                gaussians.parameters[begin + stride * gaussian] = f32::from_le_bytes([a, b, c, d]);
             }
         }
-        Ok(gaussians)
+        gaussians
     }
 }
 

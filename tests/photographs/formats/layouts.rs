@@ -47,6 +47,79 @@ fn a_model_and_its_photographs_are_found_in_the_folders_of_tools() {
 }
 
 #[test]
+fn the_files_of_a_model_are_found_in_any_case() {
+    let folder = Folder::with_text_model(&model(9));
+    let sparse = folder.join("sparse/0");
+    for (from, to) in [("cameras", "Cameras"), ("images", "IMAGES"), ("points3D", "points3d")] {
+        fs::rename(sparse.join(from).with_extension("txt"), sparse.join(to).with_extension("TXT"))
+            .unwrap();
+    }
+    assert_whole(&load(&folder), "in other case");
+    // What has the exact name comes first.
+    fs::write(sparse.join("cameras.txt"), "3 PINHOLE 40 30 1 2 3\n").unwrap();
+    refuses(&folder, &["cameras.txt"]);
+}
+
+#[test]
+fn every_eighth_photograph_that_is_there_is_held_out_and_none_of_seven() {
+    let folder = Folder::with_model(&model(9));
+    assert_eq!(names(&load(&folder), Split::Test), ["v00", "v08"]);
+    fs::remove_file(folder.join("images/v00.png")).unwrap();
+    let dataset = load(&folder);
+    assert_eq!(names(&dataset, Split::Test), ["v01"]);
+    assert_eq!(dataset.skipped, ["images/v00.png: the file is absent"]);
+    fs::remove_file(folder.join("images/v08.png")).unwrap();
+    let dataset = load(&folder);
+    assert_eq!((dataset.views.len(), names(&dataset, Split::Test).len()), (7, 0));
+    let options = LoadOptions { test_every: Some(3), ..LoadOptions::default() };
+    let dataset = Dataset::load(&folder, &options).unwrap();
+    assert_eq!(names(&dataset, Split::Test), ["v01", "v04", "v07"]);
+}
+
+#[test]
+fn masks_of_labels_are_told_and_black_ones_named() {
+    let folder = Folder::with_model(&model(9));
+    fs::create_dir_all(folder.join("masks")).unwrap();
+    let save = |index: usize, white: f32| {
+        let image = Image::from_fn(SIZE.0, SIZE.1, |x, _| [if x < 20 { white } else { 0.0 }; 3]);
+        image.save_png8(folder.join(format!("masks/{}.png", name(index)))).unwrap();
+    };
+    (0..9).for_each(|index| save(index, 1.0 / 255.0));
+    let lines = warnings(|| {
+        for view in &load(&folder).views {
+            assert_eq!(view.mask.as_ref().unwrap().weights[18..22], [1.0, 1.0, 0.0, 0.0]);
+        }
+    });
+    assert!(lines.contains("they are labels, of which 1 shows"), "{lines}");
+    (0..9).for_each(|index| save(index, f32::from(index != 3)));
+    let dataset = load(&folder);
+    assert_eq!(dataset.skipped.len(), 1);
+    let black = "masks/v03.png: the mask is black everywhere";
+    assert!(dataset.skipped[0].contains(black), "{:?}", dataset.skipped);
+}
+
+#[test]
+fn cameras_of_a_network_s_input_are_scaled_for_each_axis() {
+    // 500x375, as VGGT resizes it: a width of 518, and a height rounded to patches of 14.
+    let of_input = |height: f64| {
+        let lens = json!({ "w": 518.0, "h": height, "fl_x": 518.0, "fl_y": 392.0 });
+        let folder = Folder::with_listing(9, |listing| extend(listing, &lens));
+        for index in 0..9 {
+            let path = folder.join(format!("images/{}.png", name(index)));
+            photograph(&path, (500, 375), dark(index));
+        }
+        folder
+    };
+    let lines = warnings(|| {
+        let camera = load(&of_input(392.0)).views[0].camera;
+        assert_eq!((camera.width, camera.height), (500, 375));
+        assert!((camera.focal - glam::DVec2::new(500.0, 375.0)).length() < 1e-9, "{camera:?}");
+    });
+    assert!(lines.contains("9 cameras are of a network's input"), "{lines}");
+    refuses(&of_input(518.0), &["its camera is 518x518", "padded or cropped"]);
+}
+
+#[test]
 fn a_path_of_a_model_or_listing_names_its_dataset() {
     let folder = Folder::empty();
     photographs(&folder, "images", 0..9, 1.0);

@@ -265,7 +265,7 @@ fn a_mask_of_another_aspect_ratio_is_refused_and_a_full_mask_excludes_its_view()
     let dataset = load(root);
     assert!(!names(&dataset, Split::Train).contains(&"v00"));
     assert!(
-        dataset.skipped.join("\n").contains("v00: no pixel is a number that its mask shows"),
+        dataset.skipped.join("\n").contains("masks/v00.png: the mask is black everywhere"),
         "{:?}",
         dataset.skipped
     );

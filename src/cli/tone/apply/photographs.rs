@@ -102,7 +102,14 @@ pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<Input
         if let Some(line) = unread_in(input) {
             tracing::warn!("{line}");
         }
-        files.iter().map(|file| plain(file, args.reference.as_deref())).collect::<Result<_>>()?
+        let plain = |file: &PathBuf| plain(file, args.reference.as_deref());
+        let mut all: Vec<InputPhotograph> = files.iter().map(plain).collect::<Result<_>>()?;
+        if let Some(line) =
+            MaskFile::find_labels(all.iter_mut().filter_map(|one| one.mask.as_mut()))
+        {
+            tracing::warn!("{line}");
+        }
+        all
     };
     if photographs.is_empty() {
         return Err(Error::input(input, "contains no PNG, JPEG, WebP, TIFF or EXR image"));
