@@ -174,6 +174,8 @@ impl Writer {
 /// Reads Gaussians from a binary little-endian PLY; unknown properties are skipped.
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
+    #[cfg(feature = "io")]
+    parts::PartFile::open(path, 1)?;
     let bytes = input::bytes(path)?;
     let (gaussians, _) = parse(&bytes).map_err(|problem| Error::input(path, problem))?;
     Ok(gaussians)
