@@ -23,6 +23,7 @@ mod members;
 mod names;
 mod options;
 mod original;
+mod outside;
 mod packed;
 mod pixels;
 mod ply;
@@ -150,11 +151,12 @@ impl Dataset {
         options.check()?;
         let files = PhotographFiles::default();
         let layout = DatasetLayout::detect(root)?;
-        let Listing { frames, mut skipped, remarks, clouds, has_split } =
+        let Listing { frames, mut skipped, mut remarks, clouds, has_split } =
             select(&layout, options, &files)?;
         log_split(&layout.root, has_split, options);
         let mut sources = sources(&layout.root, &frames, options, &files, &mut skipped);
-        let headers = pixels::headers(&mut sources);
+        remarks.extend(outside::remark(&layout, &sources, options));
+        let headers = pixels::headers(&mut sources, options);
         let mut levels = levels(&layout, &sources, options, &files)?;
         let balance = white_balance_matrix(&layout.root, &sources, options, levels)?;
         let files = (sources, headers);
@@ -264,8 +266,9 @@ impl Dataset {
         options.check()?;
         let files = PhotographFiles::default();
         let layout = DatasetLayout::detect(root)?;
-        let Listing { frames, mut skipped, remarks, .. } = select(&layout, options, &files)?;
+        let Listing { frames, mut skipped, mut remarks, .. } = select(&layout, options, &files)?;
         let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
+        remarks.extend(outside::remark(&layout, &sources, options));
         let photograph = |source: ViewFiles| {
             let ViewFiles { name, split, input, reference, mask, .. } = source;
             Some(Photograph { name, split, input: input?, reference, mask })
@@ -356,6 +359,8 @@ fn sources(
                 mask: masks::find(root, frame, files),
                 depth,
                 read: [None, None],
+                decoded_sizes: [None; 2],
+                size: (frame.lens.width, frame.lens.height),
                 turns: Default::default(),
             });
         }

@@ -55,10 +55,8 @@ impl Borders {
         let sources =
             sources.filter(|source| source.split == Split::Train && source.mask.is_none());
         let candidates = sources.map(|source| {
-            let size = source.read[0].as_ref().and_then(|file| file.size().ok());
-            let size = size.or_else(|| Image::size_of(source.input.as_deref()?).ok());
             let picture = Box::new(|| source.picture());
-            BorderCandidate { size: size.unwrap_or_default(), picture }
+            BorderCandidate { size: source.decoded_sizes[0].unwrap_or_default(), picture }
         });
         Self::find(candidates, options)
     }
@@ -68,8 +66,11 @@ impl Borders {
         let training =
             photographs.iter().filter(|one| one.split == Split::Train && one.mask.is_none());
         let candidates = training.map(|Photograph { input, .. }| {
-            let picture = Box::new(|| shown(PictureFile::open(input).ok()?));
-            BorderCandidate { size: Image::size_of(input).unwrap_or_default(), picture }
+            let decoded_size = |size| options.decoded_size(size);
+            let picture =
+                Box::new(move || shown(PictureFile::open(input).ok()?.reduced(decoded_size)));
+            let size = Image::size_of(input).map(decoded_size).unwrap_or_default();
+            BorderCandidate { size, picture }
         });
         Self::find(candidates, options)
     }
