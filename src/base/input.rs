@@ -28,6 +28,20 @@ pub fn bytes(path: &Path) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
+/// The first bytes of a file, at most so many; `None` for what is not read twice, such as a pipe.
+#[cfg(feature = "io")]
+pub fn start(path: &Path, most: u64) -> Option<std::io::Result<Vec<u8>>> {
+    if let Some(start) = crate::base::tree::archived_start(path, most) {
+        return Some(start);
+    }
+    let read = || {
+        let mut bytes = vec![];
+        File::open(path)?.take(most).read_to_end(&mut bytes)?;
+        Ok(bytes)
+    };
+    path.is_file().then(read)
+}
+
 /// The text of a file in UTF-8, or in UTF-16 with a byte-order mark, which is removed.
 pub fn text(path: &Path) -> Result<String> {
     let cannot = |what: String| Error::input(path, format!("cannot be read: {what}"));

@@ -92,10 +92,33 @@ pub struct PlyHeader {
     pub comments: Vec<(usize, String)>,
 }
 
+/// The longest header that is read, bytes, and the most numbers of a vertex.
+const LONGEST_HEADER: usize = 1 << 26;
+const MOST_PROPERTIES: usize = 1000;
+
 impl PlyHeader {
+    /// Reads no more of a file than its header takes; `None` where it is no PLY.
+    #[cfg(feature = "io")]
+    pub fn read(file: &mut impl std::io::Read) -> std::io::Result<Option<Result<Self, String>>> {
+        use std::io::Read;
+        let (mut start, mut wanted) = (vec![], 1 << 16);
+        loop {
+            let more = wanted - start.len();
+            file.take(more as u64).read_to_end(&mut start)?;
+            if !start.starts_with(b"ply") {
+                return Ok(None);
+            }
+            match Self::parse(&start) {
+                Err(_) if start.len() == wanted && wanted < LONGEST_HEADER => wanted *= 2,
+                header => return Ok(Some(header)),
+            }
+        }
+    }
+
     /// Reads the header at the beginning of a file.
     pub fn parse(bytes: &[u8]) -> Result<Self, String> {
         const END: &[u8] = b"end_header";
+        let bytes = &bytes[..bytes.len().min(LONGEST_HEADER)];
         if !bytes.starts_with(b"ply") {
             return Err("is not a PLY file".to_owned());
         }
@@ -156,6 +179,9 @@ impl PlyHeader {
     fn push(&mut self, type_name: &str, name: &str) -> Result<(), String> {
         let kind = PlyScalar::from_name(type_name)
             .ok_or_else(|| format!("property `{name}` has the unknown type `{type_name}`"))?;
+        if self.properties.len() == MOST_PROPERTIES {
+            return Err(format!("has more than {MOST_PROPERTIES} numbers of a vertex"));
+        }
         if self.property(name).is_some() {
             return Err(format!("property `{name}` is there twice"));
         }
@@ -168,5 +194,24 @@ impl PlyHeader {
     /// A number of every vertex, with its place among them.
     pub fn property(&self, name: &str) -> Option<(usize, &PlyProperty)> {
         self.properties.iter().enumerate().find(|(_, property)| property.name == name)
+    }
+}
+
+#[cfg(all(test, feature = "io"))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn headers_without_an_end_or_with_many_numbers_are_refused() {
+        let header = |count: usize| {
+            let numbers: String = (0..count).map(|at| format!("property float p{at}\n")).collect();
+            format!("ply\nformat ascii 1.0\nelement vertex 0\n{numbers}end_header\n").into_bytes()
+        };
+        assert_eq!(PlyHeader::parse(&header(1000)).unwrap().properties.len(), 1000);
+        let error = PlyHeader::parse(&header(1001)).unwrap_err();
+        assert!(error.contains("more than 1000 numbers"), "{error}");
+        let mut endless = std::io::Read::chain(&b"ply\ncomment "[..], std::io::repeat(0));
+        let error = PlyHeader::read(&mut endless).unwrap().unwrap().unwrap_err();
+        assert!(error.contains("cut short in the header"), "{error}");
     }
 }

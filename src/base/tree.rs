@@ -13,6 +13,9 @@ use zip::ZipArchive;
 
 /// The largest decompressed size of an entry, bytes.
 const MOST_OF_ENTRY: u64 = 1 << 31;
+/// The longest name of an entry, bytes, and its most folders.
+const LONGEST_NAME: usize = 1024;
+const MOST_LEVELS: usize = 32;
 /// The largest decompressed size of all entries, bytes.
 const MOST_OF_ALL: u64 = 1 << 37;
 
@@ -61,14 +64,19 @@ pub(crate) fn metadata(path: &Path) -> io::Result<(u64, Option<SystemTime>)> {
 /// Opens a file.
 pub(crate) fn open(path: &Path) -> io::Result<Box<dyn ReadSeek>> {
     match archived(path) {
-        Some((archive, entry)) => Ok(Box::new(Cursor::new(archive.read(&entry)?))),
+        Some((archive, entry)) => Ok(Box::new(Cursor::new(archive.read(&entry, u64::MAX)?))),
         None => Ok(Box::new(File::open(path)?)),
     }
 }
 
 /// The bytes of a file in an archive; `None` for one on disk.
 pub(super) fn archived_bytes(path: &Path) -> Option<io::Result<Vec<u8>>> {
-    archived(path).map(|(archive, entry)| archive.read(&entry))
+    archived_start(path, u64::MAX)
+}
+
+/// The first bytes of a file in an archive, at most so many; `None` for one on disk.
+pub(super) fn archived_start(path: &Path, most: u64) -> Option<io::Result<Vec<u8>>> {
+    archived(path).map(|(archive, entry)| archive.read(&entry, most))
 }
 
 /// The archive that a path leads to or into.
@@ -104,6 +112,12 @@ impl Archive {
         let mut expanded = 0_u64;
         for index in 0..zip.len() {
             let entry = zip.by_index_raw(index).map_err(io::Error::other)?;
+            let levels = entry.name_raw().iter().filter(|&&byte| byte == b'/').count();
+            if entry.name_raw().len() > LONGEST_NAME || levels > MOST_LEVELS {
+                return Err(io::Error::other(format!(
+                    "a name in it has more than {LONGEST_NAME} bytes or {MOST_LEVELS} folders; pack it again"
+                )));
+            }
             // Names that lead out of the archive are ignored.
             let Some(name) = entry.enclosed_name().and_then(|name| slashed(&name)) else {
                 continue;
@@ -136,14 +150,14 @@ impl Archive {
         Ok(Self { zip: Mutex::new(zip), entries, folders, changed })
     }
 
-    /// The decompressed bytes of an entry.
-    fn read(&self, entry: &str) -> io::Result<Vec<u8>> {
+    /// The decompressed bytes of an entry, at most so many.
+    fn read(&self, entry: &str, most: u64) -> io::Result<Vec<u8>> {
         let &(index, length) = self.entries.get(entry).ok_or(io::ErrorKind::NotFound)?;
         let mut zip = self.zip.lock().unwrap_or_else(PoisonError::into_inner);
         let entry = zip.by_index(index).map_err(io::Error::other)?;
         let mut bytes = vec![];
         // It may expand to more than it declares.
-        entry.take(length).read_to_end(&mut bytes)?;
+        entry.take(length.min(most)).read_to_end(&mut bytes)?;
         Ok(bytes)
     }
 }
@@ -234,6 +248,18 @@ mod tests {
         for limits in [[59_999, 1 << 20], [60_000, 119_999]] {
             let error = Archive::open(&zip, limits).err().unwrap().to_string();
             assert!(error.contains("extract it first"), "{error}");
+        }
+    }
+
+    #[test]
+    fn an_archive_with_names_of_many_folders_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let zip = archive(folder.path(), &[(&("a/".repeat(32) + "x"), b"")]);
+        check(&zip).unwrap();
+        for name in ["a/".repeat(33) + "x", "a".repeat(1025)] {
+            let zip = archive(folder.path(), &[(&name, b"")]);
+            let error = check(&zip).unwrap_err().to_string();
+            assert!(error.contains("more than 1024 bytes or 32 folders"), "{error}");
         }
     }
 

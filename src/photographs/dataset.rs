@@ -23,6 +23,7 @@ mod members;
 mod names;
 mod options;
 mod original;
+mod outside;
 mod packed;
 mod pixels;
 mod ply;
@@ -158,7 +159,8 @@ impl Dataset {
         let mut sources = sources(&layout.root, &frames, options, &files, &mut skipped);
         let masks = sources.iter_mut().filter_map(|source| source.mask.as_mut());
         remarks.extend(MaskFile::find_labels(masks));
-        let headers = pixels::headers(&mut sources);
+        remarks.extend(outside::remark(&layout, &sources, options));
+        let headers = pixels::headers(&mut sources, options);
         let mut levels = levels(&layout, &sources, options, &files)?;
         let balance = white_balance_matrix(&layout.root, &sources, options, levels)?;
         let files = (sources, headers);
@@ -280,6 +282,7 @@ impl Dataset {
         let mut sources = sources(&layout.root, &frames, options, &files, &mut skipped);
         let masks = sources.iter_mut().filter_map(|source| source.mask.as_mut());
         remarks.extend(MaskFile::find_labels(masks));
+        remarks.extend(outside::remark(&layout, &sources, options));
         let photograph = |source: ViewFiles| {
             let ViewFiles { name, split, input, reference, mask, .. } = source;
             Some(Photograph { name, split, input: input?, reference, mask })
@@ -370,6 +373,8 @@ fn sources(
                 mask: masks::find(root, frame, files),
                 depth,
                 read: [None, None],
+                decoded_sizes: [None; 2],
+                size: (frame.lens.width, frame.lens.height),
                 turns: Default::default(),
             });
         }

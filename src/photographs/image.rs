@@ -11,6 +11,8 @@ mod codec;
 #[cfg(feature = "io")]
 mod colour;
 #[cfg(feature = "io")]
+mod decode;
+#[cfg(feature = "io")]
 mod decoded;
 #[cfg(feature = "io")]
 mod exif;
@@ -28,8 +30,12 @@ mod levels;
 mod mask;
 #[cfg(feature = "io")]
 mod orientation;
+#[cfg(feature = "io")]
+mod png_file;
 #[cfg(feature = "raw")]
 mod raw;
+#[cfg(feature = "io")]
+mod rows;
 #[cfg(feature = "io")]
 mod source;
 
@@ -39,7 +45,9 @@ pub(crate) use codec::openings;
 pub(crate) use exif::lens_name;
 use rayon::prelude::*;
 #[cfg(feature = "io")]
-pub(crate) use {codec::PictureFile, colour::ColourCounts, levels::Levels, mask::MaskFile};
+pub(crate) use {
+    budget::reduced_size, codec::PictureFile, colour::ColourCounts, levels::Levels, mask::MaskFile,
+};
 #[cfg(feature = "io")]
 pub use {
     exif::exposure_value, jpeg::exif_segment, levels::StoredLight, mask::Mask,
@@ -61,7 +69,7 @@ pub struct Image {
 }
 
 /// Planes from pixels of red, green and blue.
-#[cfg(feature = "io")]
+#[cfg(feature = "raw")]
 fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
     let data = (0..3).flat_map(|plane| values.iter().skip(plane).step_by(3).copied()).collect();
     Image { width, height, data }
@@ -148,10 +156,7 @@ impl Image {
                         *sum += weight * f64::from(*value);
                     }
                 }
-                let mean = move |taps: &Area| {
-                    taps.taps().map(|(x, weight)| weight * line[x]).sum::<f64>() as f32
-                };
-                columns.iter().map(mean)
+                columns.iter().map(move |taps| taps.mean_of(&line))
             })
             .collect();
         Self { width, height, data }
@@ -167,6 +172,10 @@ struct Area {
 impl Area {
     fn taps(&self) -> impl Iterator<Item = (usize, f64)> + '_ {
         self.weights.iter().enumerate().map(|(index, weight)| (self.first + index, *weight))
+    }
+
+    fn mean_of(&self, line: &[f64]) -> f32 {
+        self.taps().map(|(x, weight)| weight * line[x]).sum::<f64>() as f32
     }
 }
 

@@ -39,6 +39,8 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, ModelFacts)> {
         let file = PartFile::open(&path.join("model.ply"), 1)?;
         return Ok((gaussians, facts_of_run(&config, file.as_ref())));
     }
+    // A PLY without an end of its header may be long.
+    PartFile::open(path, 1)?;
     let bytes = input::bytes(path)?;
     let parsed = match FileKind::from_bytes(&bytes) {
         Some(FileKind::Ply) => ply::parse_any(&bytes),

@@ -15,7 +15,8 @@ pub(crate) fn make(video: &Path, folder: &Path, files: &[PathBuf], fps: u16) -> 
         return write_whole(video, &animated_png(files, fps)?);
     }
     let rate = fps.to_string();
-    let name = video.display().to_string();
+    // A name that begins with a dash is not an option.
+    let name = Path::new(".").join(video).display().to_string();
     // Even sizes, since H.264 subsamples colour.
     let output = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", &name];
     let piped = [
@@ -55,8 +56,11 @@ pub(crate) fn make(video: &Path, folder: &Path, files: &[PathBuf], fps: u16) -> 
         Ok(output) if output.status.success() => Ok(()),
         Ok(output) => {
             let printed = String::from_utf8_lossy(&output.stderr);
-            let last = printed.lines().next_back().unwrap_or("no message").to_owned();
-            Err(Error::output(video, format!("ffmpeg failed: {last}; the command was `{command}`")))
+            let first = printed.lines().next().unwrap_or("no message");
+            Err(Error::output(
+                video,
+                format!("ffmpeg failed: {first}; the command was `{command}`"),
+            ))
         }
         Err(error) if error.kind() == ErrorKind::NotFound => {
             let problem = format!(

@@ -252,7 +252,13 @@ impl Diagnosis {
         );
         scene.brought_near_white = brought_near_white(&measured, &exposure);
         // A pixel of a resized target averages this many pixels in each direction.
-        let shrink = diagnosed.iter().map(|view| options.shrink(view.size[0], view.size[1]));
+        let shrink = diagnosed.iter().zip(&views).map(|(view, (_, of))| {
+            let [width, height] = view.size;
+            let shrink = options.shrink(width, height);
+            let by_area = (f64::from(width) * f64::from(height) / pixels(&of.camera) as f64).sqrt();
+            // A large photograph was reduced before it was measured.
+            if by_area < 0.75 * shrink { by_area } else { shrink }
+        });
         scene.target_noise /= shrink.fold(1.0, f64::max);
         Ok(Self {
             dataset: dataset.root.clone(),
@@ -302,8 +308,9 @@ fn read(
     let mut photographs = vec![];
     for files in files.chunks(Image::decoded_at_once(largest)) {
         let read = files.par_iter().map(|file| {
-            let (invert_masks, name) = (options.invert_masks, file.name.clone());
-            Ok((name, PhotographStatistics::load(file, invert_masks, &borders, balance, &colours)?))
+            let name = file.name.clone();
+            let load = || PhotographStatistics::load(file, options, &borders, balance, &colours);
+            Ok((name, load()?))
         });
         photographs.extend(read.collect::<Result<Vec<_>>>()?);
     }
@@ -314,17 +321,19 @@ fn read(
 impl PhotographStatistics {
     fn load(
         file: &dataset::Photograph,
-        invert_masks: bool,
+        options: &LoadOptions,
         borders: &Borders,
         balance: Option<WhiteBalanceMatrix>,
         colours: &ColourCounts,
     ) -> Result<Self> {
-        let (mut image, alpha) = PictureFile::open(&file.input)?.decode_counted(colours)?;
+        let picture = PictureFile::open(&file.input)?;
+        let picture = picture.reduced(|size| options.decoded_size(size));
+        let (mut image, alpha) = picture.decode_counted(colours)?;
         if let Some(balance) = balance {
             balance.apply(&mut image);
         }
         let decoded = (&image, alpha.as_ref());
-        let mask = Mask::over(&file.input, decoded, file.mask.as_ref(), invert_masks)?;
+        let mask = Mask::over(&file.input, decoded, file.mask.as_ref(), options.invert_masks)?;
         let mask = borders.hide_borders(mask, (image.width, image.height));
         Ok(Self::new(&image, mask.as_ref()))
     }

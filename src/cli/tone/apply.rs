@@ -16,7 +16,7 @@ use crate::cli::{OutputFormat, driver, finish, print, progress_bar, table, word,
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
 use crate::photographs::findings::findings;
-use crate::photographs::image::{ColourCounts, Image, Mask, Orientation};
+use crate::photographs::image::{ColourCounts, Image, Mask, Orientation, PictureFile};
 use crate::photographs::metrics::Scores;
 use crate::photographs::targets::{SceneTone, Targets};
 use crate::photographs::tone::{
@@ -396,7 +396,8 @@ struct Mapped {
 fn mapped(set: &mut CurveOnSet, listed: &InputPhotograph) -> Result<Mapped> {
     let (photograph, gaps) = loaded(listed, set.inverted, &set.colours[0])?;
     let load = |path: &PathBuf| {
-        let image = Image::load_counted(path, &set.colours[1])?;
+        let file = PictureFile::open(path)?.reduced(|size| listed.decoded_size(size));
+        let (image, _) = file.decode_counted(&set.colours[1])?;
         let is_plain = listed.split.is_none();
         Ok(if is_plain { image.turned(Orientation::from_file(path)) } else { image })
     };

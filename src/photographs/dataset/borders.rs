@@ -59,10 +59,8 @@ impl Borders {
         let sources =
             sources.filter(|source| source.split == Split::Train && source.mask.is_none());
         let candidates = sources.map(|source| {
-            let size = source.read[0].as_ref().and_then(|file| file.size().ok());
-            let size = size.or_else(|| Image::size_of(source.input.as_deref()?).ok());
             let picture = Box::new(|| source.picture());
-            BorderCandidate { size: size.unwrap_or_default(), picture }
+            BorderCandidate { size: source.decoded_sizes[0].unwrap_or_default(), picture }
         });
         Self::find(candidates, options, &warn)
     }
@@ -71,17 +69,18 @@ impl Borders {
     pub(crate) fn of_photographs(photographs: &[Photograph], options: &LoadOptions) -> Self {
         let training =
             photographs.iter().filter(|one| one.split == Split::Train && one.mask.is_none());
-        let candidates = training.map(|one| BorderCandidate::of_file(&one.input));
+        let decoded_size = |size| options.decoded_size(size);
+        let candidates = training.map(|one| BorderCandidate::of_file(&one.input, decoded_size));
         Self::find(candidates, options, &warn)
     }
 
-    /// Those of files, unsaid.
+    /// Those of files at their full size, unsaid.
     #[cfg(feature = "cli")]
     pub(crate) fn of_files<'a>(
         files: impl Iterator<Item = &'a Path>,
         options: &LoadOptions,
     ) -> Self {
-        Self::find(files.map(BorderCandidate::of_file), options, &drop)
+        Self::find(files.map(|file| BorderCandidate::of_file(file, |size| size)), options, &drop)
     }
 
     /// The pixels of both.
@@ -120,9 +119,12 @@ impl Borders {
 }
 
 impl<'a> BorderCandidate<'a> {
-    fn of_file(file: &'a Path) -> Self {
-        let picture = Box::new(|| shown(PictureFile::open(file).ok()?));
-        Self { size: Image::size_of(file).unwrap_or_default(), picture }
+    fn of_file(
+        file: &'a Path,
+        decoded_size: impl Fn((u32, u32)) -> (u32, u32) + Copy + 'a,
+    ) -> Self {
+        let picture = Box::new(move || shown(PictureFile::open(file).ok()?.reduced(decoded_size)));
+        Self { size: Image::size_of(file).map(decoded_size).unwrap_or_default(), picture }
     }
 }
 

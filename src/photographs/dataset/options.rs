@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use super::PixelOrientation;
 use crate::base::settings::Rule;
 use crate::base::tree;
-use crate::photographs::image::StoredLight;
+use crate::photographs::image::{StoredLight, reduced_size};
 use crate::photographs::white_balance::WhiteBalance;
 use crate::{Error, Result};
 
@@ -116,6 +116,11 @@ impl LoadOptions {
         let beyond = self.beyond(width, height);
         let side = |pixels: u32| (f64::from(pixels) / self.downscale / beyond).round() as u32;
         (side(width), side(height))
+    }
+
+    /// The size at which a photograph of this size is decoded: a large one is reduced, unless it is loaded larger.
+    pub(crate) fn decoded_size(&self, (width, height): (u32, u32)) -> (u32, u32) {
+        reduced_size((width, height), self.loaded_size(width, height))
     }
 
     /// The downscaling factor of a photograph of this size.

@@ -26,6 +26,8 @@ pub struct Original {
     undistort: bool,
     /// The rotation from the stored pixels to those of the camera.
     orientation: Orientation,
+    /// The size that it is decoded at.
+    decoded_size: Option<(u32, u32)>,
     /// Levels of a photograph's file.
     pub(super) levels: Levels,
     /// The size that a photograph of linear light is shrunk to before it is tone-mapped.
@@ -43,12 +45,18 @@ pub struct Original {
 }
 
 impl Original {
-    pub(super) fn new(path: PathBuf, lens: Lens, undistort: bool, turns: Turns) -> Self {
+    pub(super) fn new(
+        (path, decoded_size): (PathBuf, Option<(u32, u32)>),
+        lens: Lens,
+        undistort: bool,
+        turns: Turns,
+    ) -> Self {
         Self {
             path,
             lens,
             undistort,
             orientation: turns.loading,
+            decoded_size,
             levels: Levels::default(),
             light_size: None,
             balance: None,
@@ -83,7 +91,8 @@ impl Original {
         let Self { path, lens, undistort, .. } = self;
         let preparation = Preparation::new(lens, *undistort, size, &path.to_string_lossy())?;
         let colours = ColourCounts::of_levels(self.levels);
-        let (mut image, _) = PictureFile::open(path)?.decode_counted(&colours)?;
+        let file = PictureFile::open(path)?.reduced(|size| self.decoded_size.unwrap_or(size));
+        let (mut image, _) = file.decode_counted(&colours)?;
         if let Some(balance) = self.balance {
             balance.apply(&mut image);
         }

@@ -41,9 +41,9 @@ pub(crate) type PhotographObserver<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>
 type Headers = Vec<[Option<ImageHeader>; 2]>;
 
 /// Reads the files while memory allows.
-pub(super) fn headers(sources: &mut [ViewFiles]) -> Headers {
+pub(super) fn headers(sources: &mut [ViewFiles], options: &LoadOptions) -> Headers {
     let memory = Allowance::new(MAX_READ);
-    sources.par_iter_mut().map(|source| source.headers(&memory)).collect()
+    sources.par_iter_mut().map(|source| source.headers(&memory, options)).collect()
 }
 
 /// The views in order of name. Files that cannot be decoded are named in `skipped`. Levels that a photograph exceeds
@@ -100,20 +100,21 @@ fn load_with(
     });
     let fitted = fitted.collect::<Result<Vec<_>>>()?;
     say_of_patches(&fitted);
-    let mut groups: Vec<(Lens, Vec<ViewFiles>)> = Vec::new();
+    let mut groups: Vec<LensGroup> = Vec::new();
     let mut indices = HashMap::new();
     for (_, source) in fitted {
         // The Debug output distinguishes all lenses.
-        let index = *indices.entry(format!("{:?}", source.lens)).or_insert(groups.len());
+        let key = format!("{:?} {:?}", source.lens, source.size);
+        let index = *indices.entry(key).or_insert(groups.len());
         match groups.get_mut(index) {
-            Some((_, group)) => group.push(source),
-            None => groups.push((source.lens, vec![source])),
+            Some(group) => group.files.push(source),
+            None => groups.push(LensGroup::of(source)),
         }
     }
     let options = &resolved(&groups, options);
-    let borders = Borders::of_sources(groups.iter().flat_map(|(_, group)| group), options);
-    let largest = groups.iter().map(|(lens, _)| pixel_count((lens.width, lens.height))).max();
-    let at_once = Image::decoded_at_once(largest.unwrap_or_default());
+    let borders = Borders::of_sources(groups.iter().flat_map(|group| &group.files), options);
+    let largest = groups.iter().map(|group| pixel_count((group.lens.width, group.lens.height)));
+    let at_once = Image::decoded_at_once(largest.max().unwrap_or_default());
     let originals = Allowance::new(bytes_for_originals(&groups, options));
     let colours = [ColourCounts::of_levels(levels), ColourCounts::new("reference image")];
     let loading = Loading {
@@ -129,7 +130,7 @@ fn load_with(
     while !groups.is_empty() {
         // Files that were read are dropped with their group.
         let now: Vec<_> = groups.drain(..groups.len().min(at_once)).collect();
-        let now = now.into_par_iter().map(|(lens, group)| load_group(&lens, group, &loading));
+        let now = now.into_par_iter().map(|group| load_group(group, &loading));
         loaded.extend(now.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
     if colours[0].is_beyond() {
@@ -149,15 +150,37 @@ fn load_with(
 /// Says where cameras are of a network's input, from their listed lenses.
 fn say_of_patches(fitted: &[(Lens, ViewFiles)]) {
     let is_of_patches = |(listed, source): &&(Lens, ViewFiles)| {
-        listed.fitted(source.lens.width, source.lens.height).is_none()
+        listed.fitted(source.size.0, source.size.1).is_none()
     };
     let count = fitted.iter().filter(is_of_patches).count();
-    if let Some((listed, ViewFiles { name, lens, .. })) = fitted.iter().find(is_of_patches) {
-        let [from, to] = [listed, lens].map(|lens| format!("{}x{}", lens.width, lens.height));
+    if let Some((listed, ViewFiles { name, size: (width, height), .. })) =
+        fitted.iter().find(is_of_patches)
+    {
         tracing::warn!(
-            "{count} cameras are of a network's input, rounded to 14 pixels each way ({name}: {from}, the photograph \
-             {to}): scaled for each axis"
+            "{count} cameras are of a network's input, rounded to 14 pixels each way ({name}: {}x{}, the photograph \
+             {width}x{height}): scaled for each axis",
+            listed.width,
+            listed.height
         );
+    }
+}
+
+/// Files of one lens.
+struct LensGroup {
+    /// At the size that the photographs are decoded at.
+    lens: Lens,
+    /// The size of the photographs.
+    size: (u32, u32),
+    files: Vec<ViewFiles>,
+}
+
+impl LensGroup {
+    fn of(source: ViewFiles) -> Self {
+        Self { lens: source.lens, size: source.size, files: vec![source] }
+    }
+
+    fn loaded_size(&self, options: &LoadOptions) -> (u32, u32) {
+        options.loaded_size(self.size.0, self.size.1)
     }
 }
 
@@ -179,35 +202,31 @@ struct Loading<'a> {
 
 /// Bytes that `keep` leaves for photographs at their original size, if a curve is applied at that size: it requires the
 /// statistics of all of them first.
-fn bytes_for_originals(groups: &[(Lens, Vec<ViewFiles>)], options: &LoadOptions) -> u64 {
+fn bytes_for_originals(groups: &[LensGroup], options: &LoadOptions) -> u64 {
     let most = options.keep.filter(|_| options.measured == MeasuredSize::Own);
     most.unwrap_or_default().saturating_sub(kept_bytes(groups, options))
 }
 
 /// Bytes of the photographs and reference images as loaded.
-fn kept_bytes(groups: &[(Lens, Vec<ViewFiles>)], options: &LoadOptions) -> u64 {
-    let bytes = |(lens, group): &(Lens, Vec<ViewFiles>)| {
-        let size = options.loaded_size(lens.width, lens.height);
-        let pictures = group.iter().flat_map(|source| [&source.input, &source.reference]).flatten();
+fn kept_bytes(groups: &[LensGroup], options: &LoadOptions) -> u64 {
+    let bytes = |group: &LensGroup| {
+        let size = group.loaded_size(options);
+        let pictures =
+            group.files.iter().flat_map(|source| [&source.input, &source.reference]).flatten();
         pictures.count() as u64 * pixel_count(size) * BYTES_PER_PIXEL
     };
     groups.iter().map(bytes).sum()
 }
 
 /// The options, of which `keep` is 0 where the photographs exceed it: none is kept. Says where `max_resolution` acts.
-fn resolved(groups: &[(Lens, Vec<ViewFiles>)], options: &LoadOptions) -> LoadOptions {
+fn resolved(groups: &[LensGroup], options: &LoadOptions) -> LoadOptions {
     let bytes = kept_bytes(groups, options);
-    let mut shrunk: Vec<&Lens> = vec![];
-    for (lens, _) in groups {
-        let (width, height) = options.loaded_size(lens.width, lens.height);
-        let free = LoadOptions { max_resolution: 0, ..options.clone() };
-        if free.loaded_size(lens.width, lens.height) != (width, height) {
-            shrunk.push(lens);
-        }
-    }
-    if let Some(lens) = shrunk.first() {
-        let (width, height) = options.loaded_size(lens.width, lens.height);
-        let (w, h, limit) = (lens.width, lens.height, options.max_resolution);
+    let free = LoadOptions { max_resolution: 0, ..options.clone() };
+    let is_shrunk = |group: &&LensGroup| group.loaded_size(&free) != group.loaded_size(options);
+    let shrunk: Vec<&LensGroup> = groups.iter().filter(is_shrunk).collect();
+    if let Some(group) = shrunk.first() {
+        let (width, height) = group.loaded_size(options);
+        let ((w, h), limit) = (group.size, options.max_resolution);
         let more = if shrunk.len() > 1 { ", and others alike" } else { "" };
         tracing::warn!(
             "photographs of {w}x{h} are trained on at {width}x{height}{more}: max_resolution is {limit}, 0 \
@@ -234,15 +253,18 @@ impl ViewFiles {
         // What has no readable header is named when it is decoded.
         let turns = |header: ImageHeader| Turns::new(header, &lens, pixels);
         self.turns = headers.map(|header| header.map(turns).unwrap_or_default());
-        let sizes = headers
-            .into_iter()
-            .zip(self.turns)
-            .map(|(header, turns)| header.map(|header| turns.loading.size(header.size)));
+        let sizes = headers.into_iter().zip(self.turns).map(|(header, turns)| {
+            let header = header?;
+            Some([header.size, header.decoded_size].map(|size| turns.loading.size(size)))
+        });
         let mut sized = [&self.input, &self.reference].into_iter().zip(sizes);
         let sized = sized.find_map(|(path, size)| Some((path.as_deref()?, size?)));
-        let Some((path, (width, height))) = sized else { return Ok(()) };
+        let Some((path, [(width, height), decoded])) = sized else { return Ok(()) };
+        self.size = (width, height);
         let fitted = lens.fitted(width, height).or_else(|| lens.fitted_from_patches(width, height));
-        self.lens = fitted.ok_or_else(|| disagreement(path, (width, height), &lens))?;
+        self.lens = fitted
+            .and_then(|fitted| fitted.fitted(decoded.0, decoded.1))
+            .ok_or_else(|| disagreement(path, (width, height), &lens))?;
         if (width, height) != (lens.width, lens.height) {
             tracing::info!(
                 "{}: is {width}x{height}, its camera {}x{}; intrinsics rescaled",
@@ -256,13 +278,11 @@ impl ViewFiles {
 }
 
 /// Loads the views of one lens.
-fn load_group(
-    lens: &Lens,
-    mut group: Vec<ViewFiles>,
-    loading: &Loading<'_>,
-) -> Result<Vec<LoadedView>> {
+fn load_group(group: LensGroup, loading: &Loading<'_>) -> Result<Vec<LoadedView>> {
     let options = loading.options;
-    let size = options.loaded_size(lens.width, lens.height);
+    let size = group.loaded_size(options);
+    let LensGroup { lens, files: mut group, .. } = group;
+    let lens = &lens;
     let first = group.first().map(|source| source.name.clone()).unwrap_or_default();
     let name = first.as_str();
     if lens.width.min(lens.height) < MIN_SIDE {
@@ -324,6 +344,8 @@ struct DecodedPicture {
     turns: Turns,
     /// Whether the file holds linear light.
     is_light: bool,
+    /// Its size as it is decoded, if that is known from its header.
+    decoded_size: Option<(u32, u32)>,
 }
 
 /// The pixels of a photograph or reference image as loaded, and its file if these are not all of it.
@@ -381,7 +403,8 @@ impl ViewLoader<'_> {
         let brightness = [&photograph, &reference]
             .map(|decoded| decoded.as_ref().map(|decoded| mean(&decoded.image)));
         let reference_original = reference.as_ref().map(|decoded| {
-            Original::new(decoded.path.clone(), *preparation.lens, options.undistort, decoded.turns)
+            let file = (decoded.path.clone(), decoded.decoded_size);
+            Original::new(file, *preparation.lens, options.undistort, decoded.turns)
         });
         let is_hidden = mask.as_ref().is_some_and(Mask::hides_all);
         if is_hidden {
@@ -423,14 +446,23 @@ impl ViewLoader<'_> {
     ) -> Result<Option<DecodedPicture>> {
         let lens = self.preparation.lens;
         let Some(path) = path else { return Ok(None) };
-        let file =
-            read.map_or_else(|| PictureFile::open(&path), |read| Ok(Arc::unwrap_or_clone(read)));
+        let options = self.loading.options;
+        let file = match read {
+            Some(read) => Ok(Arc::unwrap_or_clone(read)),
+            None => {
+                let file = PictureFile::open(&path);
+                file.map(|file| file.reduced(|size| options.decoded_size(size)))
+            }
+        };
+        let decoded_size = file.as_ref().ok().and_then(|file| file.decoded_size().ok());
         if let Ok(file) = &file {
             check_size(&path, file, turns, lens)?;
         }
         let is_light = file.as_ref().is_ok_and(|file| file.is_light(&colours.levels()));
         match file.and_then(|file| file.decode_counted(colours)) {
-            Ok((image, alpha)) => Ok(Some(DecodedPicture { path, image, alpha, turns, is_light })),
+            Ok((image, alpha)) => {
+                Ok(Some(DecodedPicture { path, image, alpha, turns, is_light, decoded_size }))
+            }
             Err(error) => {
                 problems.push(error.to_string());
                 Ok(None)
@@ -447,7 +479,7 @@ impl ViewLoader<'_> {
     ) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
-        let DecodedPicture { path, image, turns, is_light, .. } = decoded;
+        let DecodedPicture { path, image, turns, is_light, decoded_size, .. } = decoded;
         let whole = preparation.photograph(image.turned(turns.loading), &path, options.falloff)?;
         let whole = if is_light { preparation.shrunk_in_light(whole) } else { whole };
         let is_shrunk = preparation.size != (whole.width, whole.height);
@@ -455,7 +487,8 @@ impl ViewLoader<'_> {
         if is_kept && !is_shrunk {
             return Ok((Some(whole), None));
         }
-        let mut original = Original::new(path, *preparation.lens, options.undistort, turns);
+        let file = (path, decoded_size);
+        let mut original = Original::new(file, *preparation.lens, options.undistort, turns);
         (original.balance, original.falloff) = (loading.balance, options.falloff);
         original.levels = loading.colours[0].levels();
         original.light_size = is_light.then_some(preparation.size);
@@ -488,10 +521,10 @@ impl ViewLoader<'_> {
 
     fn reference_image(&self, decoded: DecodedPicture) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
-        let DecodedPicture { path, image, turns, .. } = decoded;
+        let DecodedPicture { path, image, turns, decoded_size, .. } = decoded;
         if loading.options.keep == Some(0) {
             let undistort = loading.options.undistort;
-            let file = Original::new(path, *preparation.lens, undistort, turns);
+            let file = Original::new((path, decoded_size), *preparation.lens, undistort, turns);
             return Ok((None, Some(file)));
         }
         Ok((Some(preparation.loaded(image.turned(turns.loading), &path)?), None))

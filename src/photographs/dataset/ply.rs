@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DVec3};
 
-use crate::base::input;
 use crate::base::ply::{PlyEncoding, PlyHeader, PlyProperty, PlyScalar};
+use crate::base::{input, tree};
 use crate::{Error, Result};
 
 /// A file of points.
@@ -18,10 +18,13 @@ pub(super) struct Cloud {
 
 /// The finite points of a file. Normals and colours are skipped: they may come from normal-light photographs.
 pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
-    let bytes = input::bytes(path)?;
+    let cannot = |error| Error::input(path, format!("cannot be read: {error}"));
     let no_points =
         |problem: &str| Error::input(path, format!("{problem}; its points are not read"));
-    let header = PlyHeader::parse(&bytes).map_err(|problem| no_points(&problem))?;
+    let header = PlyHeader::read(&mut tree::open(path).map_err(cannot)?).map_err(cannot)?;
+    let header = header.unwrap_or_else(|| Err("is not a PLY file".to_owned()));
+    let header = header.map_err(|problem| no_points(&problem))?;
+    let bytes = input::bytes(path)?;
     if header.properties.iter().any(|property| property.name.starts_with("f_dc_")) {
         return Err(no_points("is a model of Gaussians, not of points"));
     }

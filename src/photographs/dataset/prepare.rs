@@ -173,7 +173,7 @@ fn native_camera(lens: &Lens) -> Camera {
 /// Refuses a file by its declared size, before memory is allocated.
 pub(super) fn check_size(path: &Path, file: &PictureFile, turns: Turns, lens: &Lens) -> Result<()> {
     // A file without a readable header is reported when it is decoded.
-    let Ok(size) = file.size() else { return Ok(()) };
+    let Ok(size) = file.decoded_size() else { return Ok(()) };
     let (width, height) = turns.loading.size(size);
     if lens.fitted(width, height).is_none() {
         return Err(disagreement(path, size, lens));

@@ -5,9 +5,9 @@ use std::sync::Arc;
 
 use glam::DAffine3;
 
-use super::Split;
 use super::allowance::Allowance;
 use super::turns::{ImageHeader, Turns};
+use super::{LoadOptions, Split};
 use crate::base::tree;
 use crate::camera::Lens;
 use crate::photographs::image::{Image, MaskFile, Orientation, PictureFile};
@@ -26,6 +26,11 @@ pub(super) struct ViewFiles {
     pub(super) depth: Option<PathBuf>,
     /// Photograph and reference image, if they are already read.
     pub(super) read: [Option<Arc<PictureFile>>; 2],
+    /// The sizes that these are decoded at, once their headers are read.
+    pub(super) decoded_sizes: [Option<(u32, u32)>; 2],
+    /// The size of the photograph as its camera took it. It is that of the lens unless the photograph is reduced while
+    /// it is decoded.
+    pub(super) size: (u32, u32),
     /// How photograph and reference image are turned.
     pub(super) turns: [Turns; 2],
 }
@@ -33,22 +38,29 @@ pub(super) struct ViewFiles {
 impl ViewFiles {
     /// Reads the files of the photograph and of the reference image; returns the header of each, if readable, and keeps
     /// the files while `memory` allows.
-    pub(super) fn headers(&mut self, memory: &Allowance) -> [Option<ImageHeader>; 2] {
+    pub(super) fn headers(
+        &mut self,
+        memory: &Allowance,
+        options: &LoadOptions,
+    ) -> [Option<ImageHeader>; 2] {
         let paths = [self.input.as_deref(), self.reference.as_deref()];
         let mut headers = [None; 2];
+        let of_size = |size, orientation| {
+            let decoded_size = options.decoded_size(size);
+            ImageHeader { size, decoded_size, orientation }
+        };
         for ((path, read), header) in paths.into_iter().zip(&mut self.read).zip(&mut headers) {
             let Some(path) = path else { continue };
             let bytes = tree::metadata(path).map_or(u64::MAX, |(length, _)| length);
             if !memory.take(bytes) {
-                let of_size =
-                    |size| ImageHeader { size, orientation: Orientation::from_file(path) };
-                *header = Image::size_of(path).ok().map(of_size);
+                let orientation = || Orientation::from_file(path);
+                *header = Image::size_of(path).ok().map(|size| of_size(size, orientation()));
             } else if let Ok(file) = PictureFile::open(path) {
-                let of_size = |size| ImageHeader { size, orientation: file.orientation() };
-                *header = file.size().ok().map(of_size);
-                *read = Some(Arc::new(file));
+                *header = file.size().ok().map(|size| of_size(size, file.orientation()));
+                *read = Some(Arc::new(file.reduced(|size| options.decoded_size(size))));
             }
         }
+        self.decoded_sizes = headers.map(|header| header.map(|header| header.decoded_size));
         headers
     }
 
@@ -61,7 +73,10 @@ impl ViewFiles {
     pub(super) fn picture(&self) -> Option<Image> {
         let file = match &self.read[0] {
             Some(read) => PictureFile::clone(read),
-            None => PictureFile::open(self.input.as_deref()?).ok()?,
+            None => {
+                let at = self.decoded_sizes[0];
+                PictureFile::open(self.input.as_deref()?).ok()?.reduced(|size| at.unwrap_or(size))
+            }
         };
         shown(file)
     }

@@ -54,6 +54,8 @@ pub(super) enum CameraPixels {
 pub(super) struct ImageHeader {
     /// Width and height as it is stored.
     pub(super) size: (u32, u32),
+    /// Width and height as it is decoded.
+    pub(super) decoded_size: (u32, u32),
     /// How that is turned for people, by its Exif.
     pub(super) orientation: Orientation,
 }

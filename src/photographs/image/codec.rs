@@ -3,42 +3,74 @@
 use std::io::{BufReader, Cursor};
 use std::path::{Path, PathBuf};
 
-use ::image::{
-    DynamicImage, ExtendedColorType, ImageEncoder, ImageError, ImageFormat, ImageReader,
-    codecs::{jpeg::JpegEncoder, png::PngEncoder},
-    error::UnsupportedErrorKind,
-};
+use ::image::codecs::{jpeg::JpegEncoder, png::PngEncoder};
+use ::image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader};
 
-use super::colour::{self, ColourCounts, Conversion};
+use super::colour::ColourCounts;
+use super::decode::decode;
 use super::decoded::{DecodedImage, Meaning};
 #[cfg(not(feature = "raw"))]
 use super::files::RAW_REMEDY;
-use super::files::{HEIC_REMEDY, is_raw};
-use super::levels::{Levels, SampleFormat, extremes};
+use super::files::is_raw;
+use super::levels::Levels;
 use super::source::{BufReadSeek, not_an_image, reader};
-use super::{Image, Orientation, budget, exr_file, from_interleaved, jpeg, linear_from_srgb};
+use super::{Image, Orientation, exr_file, jpeg, linear_from_srgb, png_file};
 use crate::base::output::write_whole;
 use crate::base::{input, tree};
 use crate::{Error, Result};
 
+/// The bytes by which a file is told from others.
+const START: u64 = 1 << 16;
+
+/// Whether a file that begins so is read.
+fn is_of_read_format(start: &[u8]) -> bool {
+    let is_webp = start.starts_with(b"RIFF") && start.get(8..12) == Some(b"WEBP");
+    let begins: [&[u8]; 5] = [&jpeg::MAGIC, &png_file::MAGIC, &exr_file::MAGIC, b"II*\0", b"MM\0*"];
+    is_webp || begins.iter().any(|magic| start.starts_with(magic))
+}
+
 /// An image file, read whole.
 #[derive(Clone, Debug)]
 pub(crate) struct PictureFile {
-    path: PathBuf,
-    bytes: Vec<u8>,
+    pub(super) path: PathBuf,
+    pub(super) bytes: Vec<u8>,
+    /// The size that it is reduced to while it is decoded.
+    pub(super) at: Option<(u32, u32)>,
 }
 
 impl PictureFile {
     pub(crate) fn open(path: &Path) -> Result<Self> {
         #[cfg(test)]
         openings::count(path);
-        Ok(Self { path: path.to_owned(), bytes: input::bytes(path)? })
+        // What is no image is refused by its beginning, however long it is.
+        let start = input::start(path, START).and_then(std::io::Result::ok);
+        let bytes = match start {
+            Some(start) if !is_raw(path) && !is_of_read_format(&start) => start,
+            _ => input::bytes(path)?,
+        };
+        Ok(Self { path: path.to_owned(), bytes, at: None })
+    }
+
+    /// The file, reduced while it is decoded to the size that `decoded_size` gives for its own.
+    pub(crate) fn reduced(mut self, decoded_size: impl Fn((u32, u32)) -> (u32, u32)) -> Self {
+        // What has no readable header is named when it is decoded.
+        let size = self.size().ok();
+        self.at = size.and_then(|size| Some(decoded_size(size)).filter(|at| *at != size));
+        self
+    }
+
+    /// Width and height as it is decoded.
+    pub(crate) fn decoded_size(&self) -> Result<(u32, u32)> {
+        self.at.map_or_else(|| self.size(), Ok)
     }
 
     /// Width and height, from its header alone.
     pub(crate) fn size(&self) -> Result<(u32, u32)> {
         if is_raw(&self.path) {
             return raw_size(&self.path, self.bytes.clone());
+        }
+        if let Some(size) = png_file::size(&self.bytes) {
+            return Ok(size);
         }
         let reader = reader(Cursor::new(self.bytes.as_slice()));
         size_of_reader(&self.path, reader.map_err(|error| unreadable(&self.path, &error))?)
@@ -62,73 +94,12 @@ impl PictureFile {
 
     /// [`Self::decode`] that counts colour conversions in `counters` instead of logging them.
     pub(crate) fn decode_counted(self, counters: &ColourCounts) -> Result<(Image, Option<Image>)> {
-        let decoded = decode(&self.path, self.bytes, Meaning::Colour, &counters.levels())?;
+        let path = self.path.clone();
+        let decoded = decode(self, Meaning::Colour, &counters.levels())?;
         let DecodedImage { image, alpha, conversion, is_beyond, remark, .. } = decoded;
-        counters.add(&self.path, conversion, remark, is_beyond);
+        counters.add(&path, conversion, remark, is_beyond);
         Ok((image, alpha))
     }
-
-    /// The values as parts of the scale of their format; of camera RAW, which has none, as photographs have them.
-    pub(super) fn decode_as_stored(self) -> Result<(Image, Option<SampleFormat>)> {
-        let decoded = decode(&self.path, self.bytes, Meaning::Number, &Levels::default())?;
-        Ok((decoded.image, decoded.format))
-    }
-}
-
-fn decode(path: &Path, bytes: Vec<u8>, meaning: Meaning, levels: &Levels) -> Result<DecodedImage> {
-    budget::check(path, &bytes)?;
-    if bytes.starts_with(&exr_file::MAGIC) {
-        return exr_file::load(path, bytes, meaning, levels);
-    }
-    let is_jpeg = bytes.starts_with(&jpeg::MAGIC);
-    let by_libjpeg = if is_jpeg { jpeg::load(path, &bytes)? } else { None };
-    let (mut image, alpha, format) = match by_libjpeg {
-        Some(image) => (image, None, SampleFormat::Eight),
-        None => {
-            refuse_heic(path, &bytes)?;
-            if is_raw(path) {
-                return Ok(DecodedImage::as_stored(load_raw(path, bytes)?, None));
-            }
-            let reader = reader(Cursor::new(bytes.as_slice()));
-            let decoded = reader.map_err(ImageError::from).and_then(ImageReader::decode);
-            let decoded = decoded.map_err(|error| undecodable(path, &error))?;
-            let alpha = alpha_of(&decoded);
-            let (image, format) = from_decoded(decoded);
-            (image, alpha, format)
-        }
-    };
-    if meaning == Meaning::Number {
-        let stored = DecodedImage::as_stored(image, alpha);
-        return Ok(DecodedImage { format: Some(format), ..stored });
-    }
-    let remark = if format == SampleFormat::Sixteen { one_value(&image) } else { None };
-    let is_beyond = levels.apply(&mut image, format);
-    let conversion = match levels.are_linear() {
-        true => Conversion::default(),
-        false => colour::convert(&mut image, &bytes),
-    };
-    Ok(DecodedImage { image, alpha, conversion, format: Some(format), is_beyond, remark })
-}
-
-/// A line where all values of a file of 16 bits are the same.
-fn one_value(image: &Image) -> Option<String> {
-    let [least, most] = extremes(image);
-    let code = (65_535.0 * most).round();
-    (least == most).then(|| {
-        format!("every value is {code} of 65535: it shows nothing; leave it out or export it again")
-    })
-}
-
-/// The alpha of a decoded image in all three planes; `None` if it is opaque.
-fn alpha_of(decoded: &DynamicImage) -> Option<Image> {
-    if !decoded.color().has_alpha() {
-        return None;
-    }
-    let values = decoded.to_rgba32f().into_raw();
-    let alpha: Vec<f32> = values.into_iter().skip(3).step_by(4).collect();
-    let hides = alpha.iter().any(|&value| value < 1.0);
-    let (width, height) = (decoded.width(), decoded.height());
-    hides.then(|| Image { width, height, data: alpha.repeat(3) })
 }
 
 /// Counts how often each file is opened, for tests.
@@ -191,9 +162,10 @@ impl Image {
     /// # Errors
     /// [`Error::Input`] if the file cannot be read, is truncated or has another format.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
-        let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
+        let file = PictureFile::open(path.as_ref())?;
+        let path = file.path.clone();
         let DecodedImage { image, conversion, remark, .. } =
-            decode(&path, bytes, Meaning::Colour, &Levels::default())?;
+            decode(file, Meaning::Colour, &Levels::default())?;
         if let Some(problem) = conversion.unknown {
             tracing::warn!("{}: {problem} is not used; the colours count as sRGB", path.display());
         }
@@ -212,8 +184,16 @@ impl Image {
     /// of EXR.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
-        let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
-        let decoded = decode(&path, bytes, Meaning::Number, &Levels::default())?;
+        Self::load_as_stored_at(path.as_ref(), |size| size)
+    }
+
+    /// [`Self::load_as_stored`], reduced while it is decoded to the size that `decoded_size` gives for its own.
+    pub(crate) fn load_as_stored_at(
+        path: &Path,
+        decoded_size: impl Fn((u32, u32)) -> (u32, u32),
+    ) -> Result<Self> {
+        let file = PictureFile::open(path)?.reduced(decoded_size);
+        let decoded = decode(file, Meaning::Number, &Levels::default())?;
         if let Some(remark) = decoded.remark {
             tracing::warn!("{}: {remark}", path.display());
         }
@@ -229,7 +209,15 @@ impl Image {
         if is_raw(path) {
             return raw_size(path, input::bytes(path)?);
         }
-        size_of_reader(path, file_reader(path)?)
+        let start = input::start(path, START).and_then(std::io::Result::ok);
+        match png_file::size(&start.unwrap_or_default()) {
+            Some(size) => {
+                #[cfg(test)]
+                openings::count(path);
+                Ok(size)
+            }
+            None => size_of_reader(path, file_reader(path)?),
+        }
     }
 
     /// Writes an 8-bit RGB PNG: values clamped to [0, 1], rounded to nearest.
@@ -318,51 +306,18 @@ impl Image {
     }
 }
 
-/// Refuses HEIC, which phones write and no free decoder reads, with a remedy.
-fn refuse_heic(path: &Path, bytes: &[u8]) -> Result<()> {
-    let brands: [&[u8]; 6] = [b"heic", b"heix", b"hevc", b"heim", b"mif1", b"msf1"];
-    let is_heic = bytes.get(4..8) == Some(b"ftyp")
-        && bytes.get(8..12).is_some_and(|brand| brands.contains(&brand));
-    if is_heic { Err(Error::input(path, format!("is HEIC; {HEIC_REMEDY}"))) } else { Ok(()) }
-}
-
-/// Distinguishes damaged files from unsupported ones, such as a TIFF of floats, which may or may not be linear light.
-fn undecodable(path: &Path, error: &ImageError) -> Error {
-    match error {
-        ImageError::Unsupported(kind)
-            if !matches!(kind.kind(), UnsupportedErrorKind::Format(_)) =>
-        {
-            let problem =
-                format!("is not read ({kind}); save it with 8 or 16 bits, or linear light as EXR");
-            Error::input(path, problem)
-        }
-        damage => not_an_image(path, damage),
-    }
-}
-
 #[cfg(feature = "raw")]
-use super::raw::{load as load_raw, size_of as raw_size};
-
-#[cfg(not(feature = "raw"))]
-fn load_raw(path: &Path, _: Vec<u8>) -> Result<Image> {
-    Err(Error::input(path, format!("is camera RAW, which this build does not read; {RAW_REMEDY}")))
-}
+use super::raw::size_of as raw_size;
 
 #[cfg(not(feature = "raw"))]
 fn raw_size(path: &Path, _: Vec<u8>) -> Result<(u32, u32)> {
-    load_raw(path, vec![]).map(|image| (image.width, image.height))
+    Err(no_raw(path))
 }
 
-fn from_decoded(decoded: DynamicImage) -> (Image, SampleFormat) {
-    let (width, height) = (decoded.width(), decoded.height());
-    let wide = decoded.color().bytes_per_pixel() > decoded.color().channel_count();
-    let interleaved: Vec<f32> = if wide {
-        decoded.into_rgb16().iter().map(|&value| f32::from(value) / 65_535.0).collect()
-    } else {
-        decoded.into_rgb8().iter().map(|&value| f32::from(value) / 255.0).collect()
-    };
-    let format = if wide { SampleFormat::Sixteen } else { SampleFormat::Eight };
-    (from_interleaved(width, height, &interleaved), format)
+/// The error for camera RAW where it is not read.
+#[cfg(not(feature = "raw"))]
+pub(super) fn no_raw(path: &Path) -> Error {
+    Error::input(path, format!("is camera RAW, which this build does not read; {RAW_REMEDY}"))
 }
 
 #[cfg(test)]
@@ -475,8 +430,8 @@ mod tests {
         let (path, _folder) = file("a");
         let remark = |save: &dyn Fn()| {
             save();
-            let bytes = std::fs::read(&path).unwrap();
-            let decoded = decode(&path, bytes, Meaning::Colour, &Levels::default());
+            let file = PictureFile::open(&path).unwrap();
+            let decoded = decode(file, Meaning::Colour, &Levels::default());
             decoded.unwrap().remark.unwrap_or_default()
         };
         let exr = |value: &dyn Fn(u32) -> f32| {
@@ -513,6 +468,50 @@ mod tests {
             let error = Image::load(&path).unwrap_err().to_string();
             assert!(error.contains("noise.png: is not a readable"), "{error}");
         }
+    }
+
+    #[test]
+    fn images_that_other_programs_convert_name_these() {
+        let (path, _folder) = file("a.png");
+        for (begin, program) in [
+            (&b"\0\0\0\x1cftypheic"[..], "heif-convert"),
+            (b"\0\0\0 ftypavif", "avifdec"),
+            (b"\xff\x0a\xfa\x1f", "djxl"),
+            (b"\0\0\0\x0cJXL \r\n", "djxl"),
+            (b"#?RADIANCE\n", "oiiotool"),
+        ] {
+            std::fs::write(&path, [begin, &[0; 999]].concat()).unwrap();
+            let error = Image::load(&path).unwrap_err().to_string();
+            assert!(error.contains(program) && error.contains("; convert it"), "{error}");
+        }
+    }
+
+    #[test]
+    fn of_a_file_that_is_no_image_only_the_beginning_is_read() {
+        let (path, _folder) = file("a.png");
+        std::fs::File::create(&path).unwrap().set_len(1 << 30).unwrap();
+        let opened = PictureFile::open(&path).unwrap();
+        assert_eq!(opened.bytes.len() as u64, START);
+        let error = opened.decode().unwrap_err().to_string();
+        assert!(error.contains("a.png: is not a readable PNG"), "{error}");
+    }
+
+    #[test]
+    fn a_png_of_sixteen_bits_that_is_interlaced_is_read() {
+        let (path, _folder) = file("a.png");
+        let mut encoder = png::Encoder::new(std::fs::File::create(&path).unwrap(), 1, 1);
+        encoder.set_color(png::ColorType::Grayscale);
+        encoder.set_depth(png::BitDepth::Sixteen);
+        encoder.write_header().unwrap().write_image_data(&[0x12, 0x34]).unwrap();
+        let mut bytes = std::fs::read(&path).unwrap();
+        // A single pixel is the first pass, whole.
+        bytes[28] = 1;
+        let mut crc = flate2::Crc::new();
+        crc.update(&bytes[12..29]);
+        bytes[29..33].copy_from_slice(&crc.sum().to_be_bytes());
+        std::fs::write(&path, bytes).unwrap();
+        let value = Image::load(&path).unwrap().data[0];
+        assert_eq!(value.to_bits(), (f32::from(0x1234_u16) / 65_535.0).to_bits());
     }
 
     #[test]

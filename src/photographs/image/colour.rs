@@ -24,7 +24,7 @@ use moxcms::{
 use rayon::prelude::*;
 
 pub(super) use self::metadata::Chromaticities;
-use self::metadata::{Statement, statements};
+use self::metadata::{MAX_BYTES, Statement, statements};
 use super::{Image, linear_from_srgb, srgb_from_linear};
 pub(crate) use counters::ColourCounts;
 
@@ -45,18 +45,52 @@ const LEVELS: f32 = 65_535.0;
 
 /// Converts a decoded image to sRGB by the metadata of its file.
 pub(super) fn convert(image: &mut Image, bytes: &[u8]) -> Conversion {
-    let mut unknown = None;
-    for statement in statements(bytes) {
-        match ColourSpace::from_statement(&statement) {
-            Ok(None) => return Conversion { from: None, unknown },
-            Ok(Some(space)) => {
-                let outside = space.apply(image);
-                return Conversion { from: Some((space.name, outside)), unknown };
+    let converter = Converter::of_file(bytes);
+    let count = image.pixel_count();
+    let (red, rest) = image.data.split_at_mut(count);
+    let (green, blue) = rest.split_at_mut(count);
+    let [red, green, blue] = [red, green, blue].map(|plane| plane.par_chunks_mut(1 << 14));
+    let parts = red.zip(green).zip(blue);
+    let outside = parts.map(|((red, green), blue)| converter.apply([red, green, blue])).sum();
+    converter.conversion(outside, count)
+}
+
+/// Converts parts of an image to sRGB.
+pub(super) struct Converter {
+    /// The colour space, if it is not sRGB, with the linear light of every value of an 8- or 16-bit file by channel.
+    space: Option<(ColourSpace, [Vec<f32>; 3])>,
+    unknown: Option<String>,
+}
+
+impl Converter {
+    /// By the metadata of a file.
+    pub(super) fn of_file(bytes: &[u8]) -> Self {
+        let mut unknown = None;
+        for statement in statements(bytes) {
+            match ColourSpace::from_statement(&statement) {
+                Ok(space) => {
+                    let space = space.map(|space| {
+                        let tables = space.tables();
+                        (space, tables)
+                    });
+                    return Self { space, unknown };
+                }
+                Err(problem) => unknown = unknown.or(Some(problem)),
             }
-            Err(problem) => unknown = unknown.or(Some(problem)),
         }
+        Self { space: None, unknown }
     }
-    Conversion { from: None, unknown }
+
+    /// Converts pixels and clamps them; returns how many are outside sRGB.
+    pub(super) fn apply(&self, planes: [&mut [f32]; 3]) -> usize {
+        self.space.as_ref().map_or(0, |(space, tables)| space.apply(tables, planes))
+    }
+
+    /// What was done to an image of so many pixels.
+    pub(super) fn conversion(self, outside: usize, pixels: usize) -> Conversion {
+        let part = outside as f64 / pixels.max(1) as f64;
+        Conversion { from: self.space.map(|(space, _)| (space.name, part)), unknown: self.unknown }
+    }
 }
 
 /// Converts linear light of other primaries to those of sRGB. Negative values are kept: those of noise at black, and of
@@ -140,6 +174,9 @@ impl ColourSpace {
         let space = match statement {
             Statement::Srgb => return Ok(None),
             Statement::AdobeRgb => Self::of_profile(&ColorProfile::new_adobe_rgb()),
+            Statement::Profile(bytes) if bytes.len() as u64 > MAX_BYTES => {
+                Err(format!("an ICC profile of more than {} MB", MAX_BYTES >> 20))
+            }
             Statement::Profile(bytes) => {
                 let profile = ColorProfile::new_from_slice(bytes);
                 Self::of_profile(&profile.map_err(|_| "a damaged ICC profile".to_owned())?)
@@ -165,9 +202,14 @@ impl ColourSpace {
             let [red, green, blue] = curves.map(curve);
             Some([red?, green?, blue?])
         };
+        let risen = |curves: [Curve; 3]| match curves.iter().all(rises) {
+            true => Ok(curves),
+            false => Err(unusable("its curve does not rise from 0 to 1")),
+        };
         match profile.color_space {
             DataColorSpace::Gray => {
                 let curves = curves([&profile.gray_trc; 3]).ok_or_else(|| unusable("no curve"))?;
+                let curves = risen(curves)?;
                 Ok(Self { name, curves, matrix: DMat3::IDENTITY })
             }
             DataColorSpace::Rgb => {
@@ -176,6 +218,7 @@ impl ColourSpace {
                 let curves = curves([&profile.red_trc, &profile.green_trc, &profile.blue_trc]);
                 let (matrix, curves) =
                     matrix.zip(curves).ok_or_else(|| unusable("no matrix and curves"))?;
+                let curves = risen(curves)?;
                 // If the primaries are sRGB's and the curve is another, their name says nothing.
                 let standard = known_name(matrix).filter(|standard| *standard != "sRGB");
                 Ok(Self { name: standard.map_or(name, str::to_owned), curves, matrix })
@@ -277,32 +320,40 @@ impl ColourSpace {
         linear.to_array().map(|value| srgb_from_linear(value as f32))
     }
 
-    /// Converts an image and clamps it; returns the fraction of pixels outside sRGB.
-    fn apply(&self, image: &mut Image) -> f64 {
+    /// The linear light of every value of an 8- or 16-bit file, by channel.
+    fn tables(&self) -> [Vec<f32>; 3] {
+        let levels = || (0..=LEVELS as u32).map(|level| level as f32 / LEVELS);
+        self.curves.each_ref().map(|curve| levels().map(curve).collect())
+    }
+
+    /// Converts pixels and clamps them; returns how many are outside sRGB.
+    fn apply(&self, tables: &[Vec<f32>; 3], [red, green, blue]: [&mut [f32]; 3]) -> usize {
         /// A value farther beyond 0 or 1 is not due to rounding.
         const MARGIN: f32 = 1.0 / 255.0;
-        // Every value of an 8- or 16-bit file is one of these.
-        let levels = || (0..=LEVELS as u32).map(|level| level as f32 / LEVELS);
-        let tables = self.curves.each_ref().map(|curve| levels().map(curve).collect::<Vec<f32>>());
-        let count = image.pixel_count();
-        let linear = |channel: usize, at: usize| {
-            tables[channel][(image.data[channel * count + at] * LEVELS).round() as usize]
-        };
-        let pixels: Vec<[f32; 3]> = (0..count)
-            .into_par_iter()
-            .map(|at| self.encoded([linear(0, at), linear(1, at), linear(2, at)]))
-            .collect();
         // Written so that a NaN is outside.
         let is_held = |value: &f32| (-MARGIN..=1.0 + MARGIN).contains(value);
-        let outside = pixels.iter().filter(|pixel| !pixel.iter().all(is_held)).count();
-        for (plane, values) in image.data.chunks_exact_mut(count.max(1)).enumerate() {
-            for (value, pixel) in values.iter_mut().zip(&pixels) {
-                let inside = if pixel[plane] > 0.0 { pixel[plane].min(1.0) } else { 0.0 };
-                *value = (inside * LEVELS).round() / LEVELS;
+        let mut outside = 0;
+        for ((red, green), blue) in red.iter_mut().zip(green).zip(blue) {
+            let mut pixel = [red, green, blue];
+            let linear =
+                |channel: usize| tables[channel][(*pixel[channel] * LEVELS).round() as usize];
+            let converted = self.encoded([linear(0), linear(1), linear(2)]);
+            outside += usize::from(!converted.iter().all(is_held));
+            for (value, converted) in pixel.iter_mut().zip(converted) {
+                let inside = if converted > 0.0 { converted.min(1.0) } else { 0.0 };
+                **value = (inside * LEVELS).round() / LEVELS;
             }
         }
-        outside as f64 / count.max(1) as f64
+        outside
     }
+}
+
+/// Whether a curve rises from black to white, up to the offset of a display's black.
+fn rises(curve: &Curve) -> bool {
+    const OFFSET: f32 = 0.1;
+    let levels: Vec<f32> = (0..=255).map(|level| curve(level as f32 / 255.0)).collect();
+    let is_rising = levels.windows(2).all(|pair| pair[1] >= pair[0] - 1.0 / 255.0);
+    is_rising && levels[0] <= OFFSET && levels[255] >= 1.0 - OFFSET
 }
 
 fn srgb_curve() -> Curve {

@@ -1,8 +1,7 @@
 //! The result of decoding an image file.
 
-use super::Image;
 use super::colour::Conversion;
-use super::levels::SampleFormat;
+use super::{Image, linear_from_srgb, srgb_from_linear};
 
 /// The meaning of the values of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -18,8 +17,6 @@ pub(super) struct DecodedImage {
     pub(super) image: Image,
     pub(super) alpha: Option<Image>,
     pub(super) conversion: Conversion,
-    /// `None` for camera RAW.
-    pub(super) format: Option<SampleFormat>,
     /// A value is beyond the levels of the set.
     pub(super) is_beyond: bool,
     /// What is unusual about the values, without the file's name.
@@ -29,13 +26,16 @@ pub(super) struct DecodedImage {
 impl DecodedImage {
     /// Values that are not colours, or are sRGB already.
     pub(super) fn as_stored(image: Image, alpha: Option<Image>) -> Self {
-        Self {
-            image,
-            alpha,
-            conversion: Conversion::default(),
-            format: None,
-            is_beyond: false,
-            remark: None,
-        }
+        Self { image, alpha, conversion: Conversion::default(), is_beyond: false, remark: None }
+    }
+
+    /// Reduced to another size by the mean of linear light.
+    pub(super) fn resized_to(mut self, size: Option<(u32, u32)>) -> Self {
+        let Some((width, height)) = size else { return self };
+        self.image.data.iter_mut().for_each(|x| *x = linear_from_srgb(*x));
+        self.image = self.image.resized(width, height);
+        self.image.data.iter_mut().for_each(|x| *x = srgb_from_linear(*x));
+        self.alpha = self.alpha.map(|alpha| alpha.resized(width, height));
+        self
     }
 }

@@ -6,6 +6,7 @@ use std::path::Path;
 use exr::meta::attribute::AttributeValue;
 use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableImage};
 
+use super::budget::{self, Permit};
 use super::colour::{self, Chromaticities, Conversion};
 use super::decoded::{DecodedImage, Meaning};
 use super::levels::{Levels, SampleFormat, extremes};
@@ -25,7 +26,9 @@ pub(super) fn load(
     meaning: Meaning,
     levels: &Levels,
 ) -> Result<DecodedImage> {
+    let permit = Permit::wait(budget::exr_bytes(&bytes));
     let (mut image, chromaticities) = decoded(path, bytes)?;
+    drop(permit);
     let alpha = finite_part(&image);
     let conversion = match chromaticities {
         Some(chromaticities) if meaning == Meaning::Colour => {
@@ -53,8 +56,7 @@ pub(super) fn load(
         levels.apply(&mut image, SampleFormat::Float);
         image.data.iter_mut().for_each(|value| *value = srgb_from_linear(*value));
     }
-    let format = Some(SampleFormat::Float);
-    Ok(DecodedImage { image, alpha, conversion, format, is_beyond: false, remark })
+    Ok(DecodedImage { image, alpha, conversion, is_beyond: false, remark })
 }
 
 /// 1 at pixels whose values are all finite, 0 elsewhere, in all three planes; `None` if all are finite.

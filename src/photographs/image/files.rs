@@ -27,11 +27,22 @@ pub(super) fn is_raw(path: &Path) -> bool {
     is_one_of(&RAW, &path.extension().unwrap_or_default().to_string_lossy())
 }
 
-/// Extensions of files from phones, which other programs convert.
-const HEIC: [&str; 2] = ["heic", "heif"];
-/// The programs that convert them.
-pub(super) const HEIC_REMEDY: &str = "convert it first, `heif-convert IN.heic OUT.png` of libheif, or on macOS \
-     `sips -s format png IN.heic --out OUT.png`";
+/// Images that other programs convert: their kind, extensions, and the programs.
+pub(super) const CONVERTIBLE: [(&str, &[&str], &str); 4] = [
+    (
+        "HEIC",
+        &["heic", "heif"],
+        "convert it first, `heif-convert IN.heic OUT.png` of libheif, or on macOS \
+         `sips -s format png IN.heic --out OUT.png`",
+    ),
+    ("AVIF", &["avif"], "convert it first, `avifdec IN.avif OUT.png` of libavif"),
+    ("JPEG XL", &["jxl"], "convert it first, `djxl IN.jxl OUT.png` of libjxl"),
+    (
+        "Radiance HDR",
+        &["hdr"],
+        "convert it to EXR first, `oiiotool IN.hdr -o OUT.exr` of OpenImageIO",
+    ),
+];
 
 /// A photograph's name: the file name without an image's extension.
 pub(crate) fn stem(listed: &str) -> &str {
@@ -66,11 +77,12 @@ pub(crate) fn unread_in(folder: &Path) -> Option<String> {
     }
     let listed: Vec<String> =
         counts.iter().map(|(ending, count)| format!("{count} .{ending}")).collect();
-    let is_heic = counts.keys().any(|ending| is_one_of(&HEIC, ending));
     let is_raw = counts.keys().any(|ending| is_one_of(&RAW, ending));
     let mut remedy = String::new();
-    if is_heic {
-        remedy += &format!("; HEIC: {HEIC_REMEDY}");
+    for (kind, endings, program) in CONVERTIBLE {
+        if counts.keys().any(|ending| is_one_of(endings, ending)) {
+            remedy += &format!("; {kind}: {program}");
+        }
     }
     if is_raw {
         remedy += &format!("; RAW: {RAW_REMEDY}");

@@ -5,26 +5,33 @@
 mod structure;
 mod warnings;
 
-use std::panic::catch_unwind;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
 use mozjpeg::{ColorSpace, Decompress};
 
-use super::{Image, from_interleaved};
+use super::levels::SampleFormat;
+use super::rows::Rows;
 use crate::{Error, Result};
 
 /// The magic number of JPEG files.
 pub(super) const MAGIC: [u8; 2] = [0xFF, 0xD8];
 
-/// The image; `None` if libjpeg cannot convert its colour space to RGB.
-pub(super) fn load(path: &Path, bytes: &[u8]) -> Result<Option<Image>> {
+/// Decodes the rows of an image; `false` if libjpeg cannot convert its colour space to RGB.
+pub(super) fn read(path: &Path, bytes: &[u8], rows: &mut Rows<'_>) -> Result<bool> {
     // Errors of libjpeg unwind. The structure is checked first, so there should be none; this catches the rest.
-    let decoded = structure::is_sound(bytes).then(|| catch_unwind(|| decode(bytes)).ok()?.ok());
-    decoded.flatten().ok_or_else(|| {
+    let decoded = || catch_unwind(AssertUnwindSafe(|| decode(bytes, rows))).ok()?.ok();
+    structure::is_sound(bytes).then(decoded).flatten().ok_or_else(|| {
         let message =
             "this JPEG is truncated, damaged or of a rare kind; copy it again or save it as PNG";
         Error::input(path, message)
     })
+}
+
+/// Bytes of a pixel that libjpeg holds until an image is complete: the coefficients of a progressive one.
+pub(super) fn bytes_per_pixel(bytes: &[u8]) -> u64 {
+    const PROGRESSIVE: u8 = 0xC2;
+    if segments(bytes).any(|(marker, _)| marker == PROGRESSIVE) { 6 } else { 0 }
 }
 
 /// The segments of a JPEG file before its coded data: marker, and the bytes after the length.
@@ -91,26 +98,32 @@ fn set_stored_as_seen(tiff: &mut [u8]) -> Option<()> {
 }
 
 /// Decodes a file of valid structure. Its coded data must be complete; bytes between it and the end are ignored.
-fn decode(bytes: &[u8]) -> std::io::Result<Option<Image>> {
+fn decode(bytes: &[u8], rows: &mut Rows<'_>) -> std::io::Result<bool> {
     let file = Decompress::with_err(warnings::counting()).from_mem(bytes)?;
     if matches!(file.color_space(), ColorSpace::JCS_CMYK | ColorSpace::JCS_YCCK) {
-        return Ok(None);
+        return Ok(false);
     }
     // Warnings about segments before the image do not affect its pixels.
     warnings::take();
     let mut file = file.rgb()?;
-    let (width, height) = (file.width() as u32, file.height() as u32);
-    let interleaved: Vec<u8> = file.read_scanlines()?;
+    let mut row = vec![0_u8; 3 * file.width()];
+    rows.begin((file.width() as u32, file.height() as u32), SampleFormat::Eight, 3);
+    for _ in 0..file.height() {
+        if rows.push8(file.read_scanlines_into(&mut row)?).is_break() {
+            return Ok(true);
+        }
+    }
     if warnings::take() > 0 {
         return Err(std::io::ErrorKind::InvalidData.into());
     }
     file.finish()?;
-    let values: Vec<f32> = interleaved.into_iter().map(|value| f32::from(value) / 255.0).collect();
-    Ok(Some(from_interleaved(width, height, &values)))
+    Ok(true)
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::Image;
+    use super::super::rows::Destination;
     use super::*;
 
     /// Files, and the pixels that libjpeg decodes: FNV-1a of the bytes of red, green and blue.
@@ -126,6 +139,11 @@ mod tests {
         ("420_progressive.jpg", 0x2b7c_7a79_de4c_299b),
         ("411_progressive.jpg", 0x9212_8246_36cb_1b2c),
     ];
+
+    fn load(path: &Path, bytes: &[u8]) -> Result<Option<Image>> {
+        let mut rows = Rows::new(Destination::Whole);
+        Ok(read(path, bytes, &mut rows)?.then(|| rows.finish().0))
+    }
 
     fn fixture(name: &str) -> Vec<u8> {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/jpeg");
@@ -148,7 +166,8 @@ mod tests {
     /// Asserts that libjpeg decodes a file whose structure is valid; returns whether it is.
     fn decodes_if_sound(bytes: &[u8], name: &str, damage: impl std::fmt::Debug) -> bool {
         let is_sound = structure::is_sound(bytes);
-        assert!(!is_sound || catch_unwind(|| decode(bytes)).is_ok(), "{name}: {damage:x?}");
+        let decoded = || catch_unwind(|| decode(bytes, &mut Rows::new(Destination::Whole)));
+        assert!(!is_sound || decoded().is_ok(), "{name}: {damage:x?}");
         is_sound
     }
 

@@ -15,6 +15,7 @@
 //! A set has one scale. Some of its photographs are looked at, most often one, which shows that the set is as its
 //! format says; while all are decoded, a value beyond the levels shows that it is after all.
 
+use std::ops::ControlFlow;
 use std::path::Path;
 
 use rayon::prelude::*;
@@ -22,7 +23,7 @@ use rayon::prelude::*;
 use super::MIDDLE_GREY;
 use super::codec::PictureFile;
 use super::files::is_raw;
-use super::levels::{FoundLevels, Levels, SampleFormat, StoredLight, extremes};
+use super::levels::{FoundLevels, Levels, SampleFormat, StoredLight};
 
 /// Photographs that are looked at, of a set in question, and how many have to agree by more than chance.
 const LOOKED_AT: usize = 8;
@@ -98,24 +99,49 @@ struct PhotographLevels {
 }
 
 impl PhotographLevels {
+    /// Photographs of 8 bits are read to the first value that shows that they are as their format says.
     fn of_file(path: &Path, read: Option<&PictureFile>) -> Option<Self> {
-        let file = read.map_or_else(|| PictureFile::open(path), |file| Ok(file.clone()));
-        let (image, format) = file.ok()?.decode_as_stored().ok()?;
+        let opened;
+        let file = match read {
+            Some(file) => file,
+            None => {
+                opened = PictureFile::open(path).ok()?;
+                &opened
+            }
+        };
+        let (mut format, mut codes) = (None, vec![]);
+        let (mut least, mut most) = (f32::INFINITY, f32::NEG_INFINITY);
+        let mut look = |row: &[f32], of: SampleFormat, y: u32, (width, height): (u32, u32)| {
+            format = Some(of);
+            for &value in row {
+                (least, most) = (value.min(least), value.max(most));
+            }
+            // Every so many values, in the order of the planes.
+            let [width, height, y] = [width, height, y].map(|side| side as usize);
+            let step = (3 * width * height / QUANTILES_OF) | 1;
+            for (plane, values) in row.chunks_exact(width.max(1)).enumerate() {
+                let before = (plane * height + y) * width;
+                codes.extend(values.iter().skip((step - before % step) % step).step_by(step));
+            }
+            let code = |x: f32| (x * of.largest()).round();
+            let is_plain =
+                of == SampleFormat::Eight && (code(least) < VIDEO[0] || code(most) > VIDEO[1]);
+            if is_plain { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        };
+        file.show_as_stored(&mut look).ok()?;
         let format = format?;
-        let code = |x: &f32| match format {
-            SampleFormat::Float => *x,
+        let code = |x: f32| match format {
+            SampleFormat::Float => x,
             _ => (x * format.largest()).round(),
         };
-        let [least, most] = extremes(&image);
-        let mut codes: Vec<f32> =
-            image.data.iter().step_by((image.data.len() / QUANTILES_OF) | 1).map(code).collect();
+        let mut codes: Vec<f32> = codes.into_iter().map(code).collect();
         codes.sort_unstable_by(f32::total_cmp);
         let last = codes.len().checked_sub(1)?;
         let quantile = |part: f64| codes[(part * last as f64) as usize];
         Some(Self {
             format,
-            least: code(&least),
-            most: code(&most),
+            least: code(least),
+            most: code(most),
             quantiles: [0.001, 0.5, 0.99, 0.999].map(quantile),
             are_bytes: codes.iter().all(|code| code % 257.0 == 0.0),
         })

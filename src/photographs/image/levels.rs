@@ -141,17 +141,22 @@ impl Levels {
     /// Maps values of a format, as parts of its scale, to parts of the range of these levels, and encodes linear light;
     /// returns whether a value is beyond what levels of this kind allow.
     pub(super) fn apply(&self, image: &mut Image, format: SampleFormat) -> bool {
+        let parts = image.data.par_chunks_mut(1 << 16);
+        parts.map(|values| self.apply_to(values, format)).reduce(|| false, |a, b| a | b)
+    }
+
+    /// [`Self::apply`] for some values.
+    pub(super) fn apply_to(&self, values: &mut [f32], format: SampleFormat) -> bool {
         let mut is_beyond = false;
         if let Some(found) = self.found.filter(|found| found.format == format) {
             let FoundLevels { black, white, are_limits, .. } = found;
             let (scale, range) = (format.largest(), white - black);
             let code = |x: f32| if format == SampleFormat::Float { x } else { (x * scale).round() };
-            is_beyond =
-                are_limits && image.data.par_iter().any(|&x| !(black..=white).contains(&code(x)));
-            image.data.par_iter_mut().for_each(|x| *x = (code(*x) - black) / range);
+            is_beyond = are_limits && values.iter().any(|&x| !(black..=white).contains(&code(x)));
+            values.iter_mut().for_each(|x| *x = (code(*x) - black) / range);
         }
         if self.are_linear() && format != SampleFormat::Float {
-            image.data.par_iter_mut().for_each(|x| *x = srgb_from_linear(*x));
+            values.iter_mut().for_each(|x| *x = srgb_from_linear(*x));
         }
         is_beyond
     }

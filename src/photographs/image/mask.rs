@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use super::Image;
-use super::{Orientation, codec::PictureFile};
+use super::{Orientation, codec::PictureFile, reduced_size};
 use crate::{Error, Result};
 
 /// A weight for every pixel of an image: 1 if it counts, 0 if it is masked. A pixel that is masked in part is masked.
@@ -94,8 +94,8 @@ impl Mask {
             return Ok(alpha.and_then(Self::of_plane));
         };
         let inverted = inverted != *is_inverted;
-        let mut mask = Image::load_as_stored(file)?;
         let size = (image.width, image.height);
+        let mut mask = Image::load_as_stored_at(file, |stored| reduced_size(stored, size))?;
         let (shape, upright) =
             ((mask.width, mask.height), Orientation::from_file(photograph).size(size));
         let is_of_shape = |(width, height): (u32, u32)| {

@@ -26,7 +26,7 @@ pub(super) fn frames(
     let transfer = ffmpeg.probe(clip, "color_transfer");
     let filters = filters(ffmpeg, clip, transfer.as_deref().unwrap_or_default())?;
     let filter = format!("fps={}{filters}", fps * CANDIDATES as f64);
-    let pattern = folder.join("frame_%06d.png");
+    let pattern = pattern(folder);
     let options = ["-hide_banner", "-nostdin", "-i"].map(OsStr::new);
     let files = [clip.as_os_str(), "-vf".as_ref(), filter.as_ref(), pattern.as_os_str()];
     ffmpeg.run("", &[&options[..], &files].concat(), |_| {})?;
@@ -56,6 +56,12 @@ pub(super) fn frames(
         }
     }
     Ok(kept)
+}
+
+/// The files of the frames, for ffmpeg: a per cent sign of the folder is doubled.
+fn pattern(folder: &Path) -> PathBuf {
+    let escaped = folder.to_str().map(|folder| PathBuf::from(folder.replace('%', "%%")));
+    escaped.unwrap_or_else(|| folder.to_owned()).join("frame_%06d.png")
 }
 
 /// ffmpeg's filters that convert HLG and PQ to sRGB, with white at 203 cd/m2 (BT.2408). Brighter values are clipped: a
@@ -106,6 +112,12 @@ fn sharpness(frame: &Image) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_per_cent_sign_of_a_folder_is_no_number() {
+        let found = pattern(Path::new("night 100%d/frames"));
+        assert_eq!(found, Path::new("night 100%%d/frames/frame_%06d.png"));
+    }
 
     #[test]
     fn motion_blur_lowers_the_sharpness_of_a_frame() {

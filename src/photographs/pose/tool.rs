@@ -17,7 +17,7 @@ pub(super) struct Tool<'a> {
 }
 
 /// Lines of a failed program's output that its error quotes.
-const LAST_LINES: usize = 3;
+const QUOTED_LINES: usize = 3;
 
 impl<'a> Tool<'a> {
     pub(super) fn new(path: &'a Path, name: &'static str, log: &'a Path) -> Self {
@@ -66,6 +66,8 @@ impl<'a> Tool<'a> {
         let arguments =
             ["-v", "error", "-select_streams", "v:0", "-of", "default=nokey=1:noprint_wrappers=1"];
         let mut process = Command::new(self.path.with_file_name(name));
+        // A name that begins with a dash is not an option.
+        let clip = Path::new(".").join(clip);
         process.args(arguments).arg("-show_entries").arg(format!("stream={entry}")).arg(clip);
         let output = process.stdin(Stdio::null()).output().ok()?;
         let text = String::from_utf8(output.stdout).ok()?;
@@ -115,17 +117,30 @@ impl<'a> Tool<'a> {
             return Ok(());
         }
         let printed = printed();
-        let lines: Vec<&str> =
-            printed.lines().skip(1).map(str::trim).filter(|line| !line.is_empty()).collect();
-        let last = lines[lines.len().saturating_sub(LAST_LINES)..].join(" | ");
-        let last = if last.is_empty() { "no output".to_owned() } else { last };
-        Err(Error::input(self.path, format!("{command} ended with {status}: {last}")))
+        let quoted = quoted(printed.lines().skip(1));
+        Err(Error::input(self.path, format!("{command} ended with {status}: {quoted}")))
     }
 
     /// Whether the log contains `what`.
     pub(super) fn printed(&self, what: &str) -> bool {
         let printed = std::fs::read(self.log).unwrap_or_default();
         String::from_utf8_lossy(&printed).contains(what)
+    }
+}
+
+/// What a failed program's error quotes of its lines: from the first error on, or the last.
+fn quoted<'a>(lines: impl Iterator<Item = &'a str>) -> String {
+    const ERRORS: [&str; 6] = ["error", "fail", "cannot", "could not", "invalid", "no such"];
+    let lines: Vec<&str> = lines.map(str::trim).filter(|line| !line.is_empty()).collect();
+    let is_error = |line: &&str| {
+        let line = line.to_lowercase();
+        ERRORS.iter().any(|word| line.contains(word))
+    };
+    let last = lines.len().saturating_sub(QUOTED_LINES);
+    let first = lines.iter().position(is_error).unwrap_or(last);
+    match lines[first..].iter().take(QUOTED_LINES).copied().collect::<Vec<_>>().join(" | ") {
+        quoted if quoted.is_empty() => "no output".to_owned(),
+        quoted => quoted,
     }
 }
 
@@ -143,5 +158,19 @@ pub fn how_to_install(name: &str) -> &'static str {
             "Debian, Ubuntu: apt install ffmpeg; Fedora: dnf install ffmpeg-free; Arch: pacman -S ffmpeg; \
              macOS: brew install ffmpeg; Windows: winget install ffmpeg; others: https://ffmpeg.org/download.html"
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_error_of_a_program_is_quoted() {
+        let lines =
+            ["Input #0", "Could not open file", "muxing", "", "4 frames", "Conversion failed!"];
+        assert_eq!(quoted(lines.into_iter()), "Could not open file | muxing | 4 frames");
+        assert_eq!(quoted(["1", "2", "3", "4"].into_iter()), "2 | 3 | 4");
+        assert_eq!(quoted([""].into_iter()), "no output");
     }
 }

@@ -8,7 +8,8 @@ use std::io::{Cursor, Read as _, Write as _};
 use std::path::Path;
 
 use glam::Vec3;
-use image::{ExtendedColorType, ImageFormat, codecs::webp::WebPEncoder};
+use image::codecs::webp::{WebPDecoder, WebPEncoder};
+use image::{ExtendedColorType, ImageDecoder, ImageError};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use zip::ZipArchive;
@@ -262,6 +263,8 @@ struct Rest {
     files: [String; 2],
 }
 
+/// The most rows of the palette: it has at most 65 536 sets.
+const MOST_ROWS: usize = 1024;
 /// Maximum size of a file in the archive, bytes.
 const MOST: u64 = 1 << 30;
 
@@ -328,11 +331,14 @@ fn decode_rest(
     let coefficients = rest_coefficients(rest.bands);
     let [sets, labels] = &rest.files;
     let labels = image_of(zip, labels, gaussians.count)?;
-    let sets = image_of(zip, sets, 0)?;
     let per_row = SETS_PER_ROW * coefficients;
-    if coefficients > 0 && sets.1 != per_row {
-        return Err(format!("{} is {} pixels wide, not {per_row}", rest.files[0], sets.1));
-    }
+    let sets = image_within(zip, sets, |width, height| {
+        if coefficients > 0 && width != per_row {
+            return Err(format!("is {width} pixels wide, not {per_row}"));
+        }
+        let is_more = height > MOST_ROWS;
+        if is_more { Err(format!("has {height} rows, more than {MOST_ROWS}")) } else { Ok(()) }
+    })?;
     let rows = gaussians.rest_mut().chunks_exact_mut(coefficients.max(1));
     for (values, [a, b, ..]) in rows.zip(&labels.0) {
         let first = coefficients * usize::from(u16::from_le_bytes([*a, *b]));
@@ -353,8 +359,8 @@ fn bytes_of(zip: &mut Archive<'_>, name: &str) -> Result<Vec<u8>, String> {
     Ok(bytes)
 }
 
-/// Pixels, and their number in a row.
-struct SogPixels(Vec<[u8; 4]>, usize);
+/// The pixels of an image.
+struct SogPixels(Vec<[u8; 4]>);
 
 impl std::ops::Index<usize> for SogPixels {
     type Output = [u8; 4];
@@ -364,15 +370,33 @@ impl std::ops::Index<usize> for SogPixels {
     }
 }
 
-/// An image of at least `count` pixels.
+/// An image of at least `count` pixels, and of few more: encoders fill up to a multiple of four rows.
 fn image_of(zip: &mut Archive<'_>, name: &str, count: usize) -> Result<SogPixels, String> {
-    let image = image::load_from_memory_with_format(&bytes_of(zip, name)?, ImageFormat::WebP);
-    let image = image.map_err(|error| format!("{name}: {error}"))?.to_rgba8();
+    image_within(zip, name, |width, height| {
+        let pixels = width.saturating_mul(height);
+        let is_enough = pixels >= count;
+        let is_more = height > count.div_ceil(width.max(1)).next_multiple_of(4).max(4);
+        match is_enough && !is_more {
+            true => Ok(()),
+            false => Err(format!("has {pixels} pixels for {count} Gaussians")),
+        }
+    })
+}
+
+/// An image whose header has a size, width and height, that `check` accepts.
+fn image_within(
+    zip: &mut Archive<'_>,
+    name: &str,
+    check: impl FnOnce(usize, usize) -> Result<(), String>,
+) -> Result<SogPixels, String> {
+    let bytes = bytes_of(zip, name)?;
+    let unreadable = |error: ImageError| format!("{name}: {error}");
+    let decoder = WebPDecoder::new(Cursor::new(bytes.as_slice())).map_err(unreadable)?;
+    let (width, height) = decoder.dimensions();
+    check(width as usize, height as usize).map_err(|problem| format!("{name} {problem}"))?;
+    let image = image::DynamicImage::from_decoder(decoder).map_err(unreadable)?.to_rgba8();
     let (pixels, _) = image.as_raw().as_chunks();
-    if pixels.len() < count {
-        return Err(format!("{name} has {} pixels for {count} Gaussians", pixels.len()));
-    }
-    Ok(SogPixels(pixels.to_vec(), image.width() as usize))
+    Ok(SogPixels(pixels.to_vec()))
 }
 
 /// The three numbers that a pixel encodes.
@@ -467,6 +491,34 @@ mod tests {
         for count in [0, 1] {
             let file = encode(&drawn(count, 1), &Provenance::default()).unwrap();
             assert_eq!(decode(&file).unwrap().0.count, count);
+        }
+    }
+
+    #[test]
+    fn an_image_with_far_more_pixels_than_gaussians_is_refused_by_its_header() {
+        let name = "means_l.webp";
+        let found = |(width, height): (u32, u32), count| {
+            let mut image = Vec::new();
+            let pixels = vec![0; 4 * (width * height) as usize];
+            WebPEncoder::new_lossless(&mut image)
+                .encode(&pixels, width, height, ExtendedColorType::Rgba8)
+                .unwrap();
+            let mut zip = ZipWriter::new(Cursor::new(vec![]));
+            zip.start_file(
+                name,
+                SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored),
+            )
+            .unwrap();
+            std::io::Write::write_all(&mut zip, &image).unwrap();
+            let file = zip.finish().unwrap().into_inner();
+            let mut zip = ZipArchive::new(Cursor::new(file.as_slice())).unwrap();
+            image_of(&mut zip, name, count).map(|pixels| pixels.0.len())
+        };
+        assert_eq!(found((4, 4), 1), Ok(16));
+        assert_eq!(found((8, 8), 40), Ok(64));
+        for (size, count) in [((8, 8), 1), ((8, 8), 65)] {
+            let error = found(size, count).unwrap_err();
+            assert!(error.contains("64 pixels"), "{error}");
         }
     }
 }

@@ -153,6 +153,18 @@ impl SpzHeader {
         if self.version == 2 { 3 } else { 4 }
     }
 
+    /// Refuses a file of so many bytes that packs more than a model does.
+    fn check_ratio(&self, packed: usize) -> Result<(), String> {
+        /// Bytes for each byte packed, of models that are not small.
+        const MOST: usize = 200;
+        const SMALL: usize = 1 << 24;
+        let bytes: usize = self.lengths().into_iter().fold(0, usize::saturating_add);
+        if bytes <= SMALL.max(packed.saturating_mul(MOST)) {
+            return Ok(());
+        }
+        Err(format!("packs {bytes} bytes in {packed}, more than {MOST} in one: it is no model"))
+    }
+
     /// The bytes of each stream.
     fn lengths(&self) -> [usize; 6] {
         let rest = 3 * rest_coefficients(self.degree);
@@ -184,6 +196,7 @@ fn unzipped(file: &[u8]) -> Result<(SpzHeader, Streams, Vec<u8>), String> {
     if !(2..=3).contains(&header.version) {
         return Err(header.refused());
     }
+    header.check_ratio(file.len())?;
     let mut streams = Streams::default();
     for (stream, length) in streams.iter_mut().zip(header.lengths()) {
         *stream = exactly(&mut decoder, length)?;
@@ -204,6 +217,7 @@ fn unpacked(file: &[u8]) -> Result<(SpzHeader, Streams, Vec<u8>), String> {
     if header.version != 4 {
         return Err(header.refused());
     }
+    header.check_ratio(file.len())?;
     let stream_count = usize::from(word(file, 12)?.to_le_bytes()[3]);
     let table = word(file, 16)? as usize;
     let mut rest = file.get(table..).and_then(|table| table.get(16 * stream_count..));
@@ -432,5 +446,14 @@ mod tests {
         assert_eq!(problem, "states near `x.1`, which is not a finite number above 0");
         file[4] = 9;
         assert_eq!(decode(&file).unwrap_err(), "is SPZ of version 9; versions 2 to 4 are read");
+    }
+
+    #[test]
+    fn a_small_file_that_expands_to_millions_of_gaussians_is_refused() {
+        let header =
+            SpzHeader { version: 3, count: 1 << 21, degree: 0, fraction: 12, antialiased: false };
+        let error = header.check_ratio(100_000).unwrap_err();
+        assert!(error.contains("more than 200 in one"), "{error}");
+        header.check_ratio(1_000_000).unwrap();
     }
 }

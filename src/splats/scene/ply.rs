@@ -177,6 +177,8 @@ impl Writer {
 /// Reads Gaussians from a PLY, binary little-endian or text; unknown properties are skipped.
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
+    #[cfg(feature = "io")]
+    parts::PartFile::open(path, 1)?;
     let bytes = input::bytes(path)?;
     let (gaussians, _) = parse(&bytes).map_err(|problem| Error::input(path, problem))?;
     Ok(gaussians)

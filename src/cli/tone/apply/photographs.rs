@@ -32,6 +32,8 @@ pub(super) struct InputPhotograph {
     pub(super) balance: Option<WhiteBalanceMatrix>,
     /// The levels of the set.
     pub(super) levels: Levels,
+    /// A large photograph is reduced: it is only measured.
+    pub(super) is_reduced: bool,
     /// What the photographs of a dataset do not show at their borders.
     pub(super) borders: Arc<Borders>,
 }
@@ -43,7 +45,8 @@ impl InputPhotograph {
         inverted: bool,
         colours: &ColourCounts,
     ) -> Result<(Image, Vec<usize>)> {
-        let (mut image, alpha) = PictureFile::open(&self.input)?.decode_counted(colours)?;
+        let file = PictureFile::open(&self.input)?.reduced(|size| self.decoded_size(size));
+        let (mut image, alpha) = file.decode_counted(colours)?;
         if let Some(balance) = self.balance {
             balance.apply(&mut image);
         }
@@ -52,6 +55,11 @@ impl InputPhotograph {
         let mask = self.borders.hide_borders(mask, (image.width, image.height));
         let hidden = mask.as_ref().map(Mask::hidden).unwrap_or_default();
         Ok((image, hidden))
+    }
+
+    /// The size at which a photograph or reference image of this size is decoded.
+    pub(super) fn decoded_size(&self, size: (u32, u32)) -> (u32, u32) {
+        if self.is_reduced { measured_only().decoded_size(size) } else { size }
     }
 
     /// Image and indices turned upright by Exif; photographs of a dataset stay as stored, as their cameras assume.
@@ -79,10 +87,12 @@ pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<Input
     let unreadable =
         |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));
     std::fs::metadata(input).map_err(unreadable)?;
+    let is_reduced = args.out.is_none();
     let mut photographs = if !tree::is_dir(input) {
         vec![plain(input, args.reference.as_deref())?]
     } else if Dataset::is_at(input) {
-        let options = LoadOptions { reference: args.reference.clone(), ..LoadOptions::default() };
+        let loading = if is_reduced { measured_only() } else { LoadOptions::default() };
+        let options = LoadOptions { reference: args.reference.clone(), ..loading };
         let of_dataset = Dataset::photographs(input, &options)?;
         let borders = Arc::new(Borders::of_photographs(&of_dataset, &options));
         let of_view = |Photograph { name, split, input, reference, mask }| InputPhotograph {
@@ -94,6 +104,7 @@ pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<Input
             target: None,
             balance: None,
             levels: Levels::default(),
+            is_reduced,
             borders: borders.clone(),
         };
         of_dataset.into_iter().map(of_view).collect()
@@ -123,11 +134,17 @@ pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<Input
     let balance = balance.map(|balance| balance.matrix(input, named(), levels)).transpose()?;
     for photograph in &mut photographs {
         (photograph.balance, photograph.levels) = (balance, levels);
+        photograph.is_reduced = is_reduced;
     }
     if let Some(out) = &args.out {
         set_targets(&mut photographs, out, args.format)?;
     }
     Ok(photographs)
+}
+
+/// Options with which a large photograph is decoded for its statistics alone.
+fn measured_only() -> LoadOptions {
+    LoadOptions { max_resolution: 1, ..LoadOptions::default() }
 }
 
 /// A photograph outside of a dataset.
@@ -157,6 +174,7 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<InputPhotograph> {
         target: None,
         balance: None,
         levels: Levels::default(),
+        is_reduced: false,
         borders,
     })
 }

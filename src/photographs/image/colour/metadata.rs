@@ -34,8 +34,8 @@ pub(super) enum Statement {
 /// CIE x and y of white, red, green and blue.
 pub(in super::super) type Chromaticities = [[f64; 2]; 4];
 
-/// Limit for a decompressed profile, bytes.
-const MAX_BYTES: u64 = 1 << 24;
+/// Limit for a profile, bytes; a longer one is none.
+pub(super) const MAX_BYTES: u64 = 1 << 24;
 
 const PNG: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
 
@@ -143,8 +143,9 @@ fn of_png(bytes: &[u8]) -> Vec<Statement> {
 fn inflated(data: &[u8]) -> Statement {
     let compressed = data.iter().position(|&byte| byte == 0).and_then(|at| data.get(at + 2..));
     let mut profile = vec![];
-    let read =
-        ZlibDecoder::new(compressed.unwrap_or_default()).take(MAX_BYTES).read_to_end(&mut profile);
+    let read = ZlibDecoder::new(compressed.unwrap_or_default())
+        .take(MAX_BYTES + 1)
+        .read_to_end(&mut profile);
     match read {
         Ok(_) => Statement::Profile(profile),
         Err(_) => Statement::Unknown("a damaged ICC profile".to_owned()),

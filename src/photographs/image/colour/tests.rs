@@ -260,6 +260,20 @@ fn a_damaged_profile_is_only_ignored() {
 }
 
 #[test]
+fn a_profile_whose_curve_does_not_rise_or_that_is_too_long_is_not_used() {
+    let unknown = |profile: &[u8]| {
+        let (_, conversion) = read(&png(&[[0.2; 3]], &[(b"iCCP", iccp(profile))]));
+        assert_eq!(conversion.from, None);
+        conversion.unknown.unwrap()
+    };
+    let flat = unknown(&matrix_profile(ADOBE, TransferFunction::Power(0.0)));
+    assert!(flat.contains("does not rise from 0 to 1"), "{flat}");
+    let mut long = matrix_profile(ADOBE, TransferFunction::Power(2.2));
+    long.resize((1 << 24) + 1, 0);
+    assert!(unknown(&long).contains("more than 16 MB"));
+}
+
+#[test]
 fn colours_outside_srgb_are_clipped_and_counted() {
     // The green of Adobe RGB, its white, and a grey.
     let colours = [[0.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.2, 0.2, 0.2], [0.1, 0.1, 0.1]];

@@ -12,8 +12,6 @@ use crate::{Error, Result};
 
 /// The Gaussians of a part: 15 MB of degree 3.
 pub(crate) const PART: usize = 1 << 16;
-/// A header with longer edit lists is read with the whole file.
-const LONGEST_HEADER: u64 = 1 << 26;
 
 /// A PLY file whose Gaussians are read part by part, as often as they are needed.
 #[derive(Debug)]
@@ -35,18 +33,9 @@ impl PartFile {
         }
         let mut file = File::open(path).map_err(cannot)?;
         let length = file.metadata().map_err(cannot)?.len();
-        let (mut start, mut read) = (vec![], 1 << 16);
-        let header = loop {
-            let more = read - start.len() as u64;
-            (&mut file).take(more).read_to_end(&mut start).map_err(cannot)?;
-            if !start.starts_with(b"ply") {
-                return Ok(None);
-            }
-            match PlyHeader::parse(&start) {
-                Ok(header) => break header,
-                Err(_) if read < length.min(LONGEST_HEADER) => read *= 2,
-                Err(problem) => return Err(Error::input(path, problem)),
-            }
+        let header = match PlyHeader::read(&mut file).map_err(cannot)? {
+            Some(header) => header.map_err(|problem| Error::input(path, problem))?,
+            None => return Ok(None),
         };
         if header.encoding == PlyEncoding::Text {
             return Ok(None);
