@@ -28,7 +28,7 @@ pub fn bytes(path: &Path) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// The first bytes of a file, at most so many; `None` for what is not read twice, such as a pipe.
+/// The first bytes of a file, at most `most`; `None` for what is not read twice, such as a pipe.
 #[cfg(feature = "io")]
 pub fn start(path: &Path, most: u64) -> Option<std::io::Result<Vec<u8>>> {
     if let Some(start) = crate::base::tree::archived_start(path, most) {

@@ -74,7 +74,7 @@ pub(super) fn archived_bytes(path: &Path) -> Option<io::Result<Vec<u8>>> {
     archived_start(path, u64::MAX)
 }
 
-/// The first bytes of a file in an archive, at most so many; `None` for one on disk.
+/// The first bytes of a file in an archive, at most `most`; `None` for one on disk.
 pub(super) fn archived_start(path: &Path, most: u64) -> Option<io::Result<Vec<u8>>> {
     archived(path).map(|(archive, entry)| archive.read(&entry, most))
 }
@@ -150,7 +150,7 @@ impl Archive {
         Ok(Self { zip: Mutex::new(zip), entries, folders, changed })
     }
 
-    /// The decompressed bytes of an entry, at most so many.
+    /// The decompressed bytes of an entry, at most `most`.
     fn read(&self, entry: &str, most: u64) -> io::Result<Vec<u8>> {
         let &(index, length) = self.entries.get(entry).ok_or(io::ErrorKind::NotFound)?;
         let mut zip = self.zip.lock().unwrap_or_else(PoisonError::into_inner);

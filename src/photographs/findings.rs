@@ -18,6 +18,8 @@ const MAX_EXTREME: f64 = 0.97;
 /// camera rather than of the scene: chair of LOM has 0.31 and 0.85, and its targets then err by 3.9 dB in colour.
 const MAX_PALE: f64 = 0.38;
 const MAX_BLUE: f64 = 0.9;
+/// From this gain on, photographs are dark.
+const MIN_DARK_GAIN: f64 = 2.0;
 /// Below this luminance a pixel is black.
 const BLACK: f64 = 2.0 / 255.0;
 
@@ -148,7 +150,8 @@ fn lost_blue(
 ) -> Option<String> {
     let (saturation, [_, green, blue]) = (all.saturation(), channel_means(lit));
     let is_pale = (EMPTY_CHANNEL..MAX_PALE).contains(&saturation) && blue < MAX_BLUE * green;
-    (is_pale && exposure.lit == 0 && blue > EMPTY_CHANNEL * green).then(|| {
+    let is_dark = exposure.lit == 0 && exposure.gain > MIN_DARK_GAIN;
+    (is_pale && is_dark && blue > EMPTY_CHANNEL * green).then(|| {
         format!(
             "colours are pale and lack blue (saturation {saturation:.2}, blue {:.2} of green), which the automatic \
              curve keeps: a photograph in normal light (`tone fit --profile`) or a colour chart (`--white-balance`) \

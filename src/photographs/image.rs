@@ -11,6 +11,8 @@ mod codec;
 #[cfg(feature = "io")]
 mod colour;
 #[cfg(feature = "io")]
+mod declared;
+#[cfg(feature = "io")]
 mod decode;
 #[cfg(feature = "io")]
 mod decoded;
@@ -46,7 +48,7 @@ pub(crate) use exif::lens_name;
 use rayon::prelude::*;
 #[cfg(feature = "io")]
 pub(crate) use {
-    budget::reduced_size, codec::PictureFile, colour::ColourCounts, levels::Levels, mask::MaskFile,
+    budget::reduced_size, colour::ColourCounts, decode::PictureFile, levels::Levels, mask::MaskFile,
 };
 #[cfg(feature = "io")]
 pub use {

@@ -11,32 +11,36 @@ use crate::architecture::{ROOT, paths};
 /// Lines that are not blank (code, comments, unit tests) of a folder, and what it is for. A folder of `src` includes
 /// the file of its name beside it.
 const BUDGET: &[(&str, usize, &str)] = &[
-    ("src/base", 1014, "Errors, files, hashes, settings and random numbers."),
+    (
+        "src/base",
+        1242,
+        "Errors, files, tables, hashes, settings and random numbers; what planted links decide.",
+    ),
     ("src/blocks", 1379, "Scenes that outgrow a device, in parts."),
-    ("src/camera", 2111, "Cameras, their models, patches and paths."),
+    ("src/camera", 2138, "Cameras, their models, patches and paths."),
     ("src/capi", 1701, "The interface in C."),
-    ("src/cli", 9788, "Arguments and text of the commands."),
-    ("src/gpu", 6545, "Vulkan: devices, buffers, passes, and what hosts lend."),
-    ("src/loss", 2053, "The terms of the loss."),
+    ("src/cli", 10015, "Arguments and text of the commands."),
+    ("src/gpu", 6573, "Vulkan: devices, buffers, passes, and what hosts lend."),
+    ("src/loss", 2073, "The terms of the loss."),
     ("src/networks", 2638, "Denoiser, tonemapper, structure and LPIPS."),
     (
         "src/photographs",
-        19393,
-        "Images, datasets, tone curves and their fits; nights: levels, findings, scenes; a chart.",
+        20663,
+        "Images, datasets, tone curves and their fits; nights, a chart; rows while decoding, limits of small files.",
     ),
     ("src/reference", 5793, "Each kernel on the CPU, with the bounds of its errors."),
-    ("src/results", 11146, "Runs, scores, reports, edits and files of models."),
-    ("src/splats", 7741, "Gaussians: rendering, optimizer, density control."),
+    ("src/results", 11407, "Runs, scores, reports, edits and files of models."),
+    ("src/splats", 7843, "Gaussians: rendering, optimizer, density control."),
     (
         "src/train",
-        10715,
+        10724,
         "The trainer and its settings, diagnosis and plan; fall-off, bands of lamps; detail of a score.",
     ),
-    ("src", 924, "Files without a folder: the list of modules, the self-test."),
-    ("tests", 30843, "What no unit test of a file can show."),
+    ("src", 944, "Files without a folder: the list of modules, the self-test."),
+    ("tests", 31164, "What no unit test of a file can show."),
     ("shaders-glsl", 6050, "The kernels."),
-    ("scripts", 5200, "Measurements, packages, checks against other programs."),
-    ("docs", 2005, "What users and contributors read."),
+    ("scripts", 5254, "Measurements, packages, checks against other programs."),
+    ("docs", 2015, "What users and contributors read."),
 ];
 
 /// What is written by hand; the rest is data or generated.

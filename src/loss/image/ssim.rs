@@ -35,8 +35,8 @@ enum SsimKernels {
     },
 }
 
-/// The one kernel in each of `LAYOUTS`, compiled for the first view that needs it: a software device takes longer for that
-/// than for a step.
+/// The one kernel in each of `LAYOUTS`, compiled for the first view that needs it: a software device takes longer for
+/// that than for a step.
 #[derive(Debug)]
 struct StripKernels {
     gpu: Gpu,

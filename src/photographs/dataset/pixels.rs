@@ -108,7 +108,7 @@ fn load_with(
         let index = *indices.entry(key).or_insert(groups.len());
         match groups.get_mut(index) {
             Some(group) => group.files.push(source),
-            None => groups.push(LensGroup::of(source)),
+            None => groups.push(LensGroup::new(source)),
         }
     }
     let options = &resolved(&groups, options);
@@ -175,7 +175,7 @@ struct LensGroup {
 }
 
 impl LensGroup {
-    fn of(source: ViewFiles) -> Self {
+    fn new(source: ViewFiles) -> Self {
         Self { lens: source.lens, size: source.size, files: vec![source] }
     }
 

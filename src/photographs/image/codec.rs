@@ -7,10 +7,10 @@ use ::image::codecs::{jpeg::JpegEncoder, png::PngEncoder};
 use ::image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader};
 
 use super::colour::ColourCounts;
-use super::decode::decode;
-use super::decoded::{DecodedImage, Meaning};
 #[cfg(not(feature = "raw"))]
-use super::files::RAW_REMEDY;
+use super::decode::no_raw;
+use super::decode::{PictureFile, decode};
+use super::decoded::{DecodedImage, Meaning};
 use super::files::is_raw;
 use super::levels::Levels;
 use super::source::{BufReadSeek, not_an_image, reader};
@@ -27,15 +27,6 @@ fn is_of_read_format(start: &[u8]) -> bool {
     let is_webp = start.starts_with(b"RIFF") && start.get(8..12) == Some(b"WEBP");
     let begins: [&[u8]; 5] = [&jpeg::MAGIC, &png_file::MAGIC, &exr_file::MAGIC, b"II*\0", b"MM\0*"];
     is_webp || begins.iter().any(|magic| start.starts_with(magic))
-}
-
-/// An image file, read whole.
-#[derive(Clone, Debug)]
-pub(crate) struct PictureFile {
-    pub(super) path: PathBuf,
-    pub(super) bytes: Vec<u8>,
-    /// The size that it is reduced to while it is decoded.
-    pub(super) at: Option<(u32, u32)>,
 }
 
 impl PictureFile {
@@ -312,12 +303,6 @@ use super::raw::size_of as raw_size;
 #[cfg(not(feature = "raw"))]
 fn raw_size(path: &Path, _: Vec<u8>) -> Result<(u32, u32)> {
     Err(no_raw(path))
-}
-
-/// The error for camera RAW where it is not read.
-#[cfg(not(feature = "raw"))]
-pub(super) fn no_raw(path: &Path) -> Error {
-    Error::input(path, format!("is camera RAW, which this build does not read; {RAW_REMEDY}"))
 }
 
 #[cfg(test)]

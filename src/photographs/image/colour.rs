@@ -86,7 +86,7 @@ impl Converter {
         self.space.as_ref().map_or(0, |(space, tables)| space.apply(tables, planes))
     }
 
-    /// What was done to an image of so many pixels.
+    /// What was done to an image of `pixels` pixels.
     pub(super) fn conversion(self, outside: usize, pixels: usize) -> Conversion {
         let part = outside as f64 / pixels.max(1) as f64;
         Conversion { from: self.space.map(|(space, _)| (space.name, part)), unknown: self.unknown }

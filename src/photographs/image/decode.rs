@@ -1,23 +1,31 @@
 //! Decodes image files: row by row where their format allows it, else whole.
 
 use std::io::Cursor;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use ::image::error::UnsupportedErrorKind;
 use ::image::{DynamicImage, ImageError};
 
 use super::budget::{self, Permit};
-use super::codec::PictureFile;
-#[cfg(not(feature = "raw"))]
-use super::codec::no_raw;
 use super::colour::{self, Conversion, Converter};
 use super::decoded::{DecodedImage, Meaning};
+#[cfg(not(feature = "raw"))]
+use super::files::RAW_REMEDY;
 use super::files::{CONVERTIBLE, is_raw};
 use super::levels::{Levels, SampleFormat};
 use super::rows::{Destination, RowObserver, Rows};
 use super::source::{not_an_image, reader};
-use super::{Image, exr_file, jpeg, png_file};
+use super::{Image, declared, exr_file, jpeg, png_file};
 use crate::{Error, Result};
+
+/// An image file, read whole.
+#[derive(Clone, Debug)]
+pub(crate) struct PictureFile {
+    pub(super) path: PathBuf,
+    pub(super) bytes: Vec<u8>,
+    /// The size that it is reduced to while it is decoded.
+    pub(super) at: Option<(u32, u32)>,
+}
 
 /// Shows the rows of an image of floats.
 pub(super) fn show(image: &Image, observer: RowObserver<'_>) {
@@ -35,7 +43,7 @@ pub(super) fn show(image: &Image, observer: RowObserver<'_>) {
 pub(super) fn decode(file: PictureFile, meaning: Meaning, levels: &Levels) -> Result<DecodedImage> {
     let PictureFile { path, bytes, at } = file;
     let path = path.as_path();
-    let pixels = budget::check(path, &bytes)?;
+    let pixels = declared::pixels(path, &bytes)?;
     if bytes.starts_with(&exr_file::MAGIC) {
         return Ok(exr_file::load(path, bytes, meaning, levels)?.resized_to(at));
     }
@@ -197,6 +205,12 @@ fn undecodable(path: &Path, error: &ImageError) -> Error {
 #[cfg(feature = "raw")]
 use super::raw::load as load_raw;
 
+/// The error for camera RAW where it is not read.
+#[cfg(not(feature = "raw"))]
+pub(super) fn no_raw(path: &Path) -> Error {
+    Error::input(path, format!("is camera RAW, which this build does not read; {RAW_REMEDY}"))
+}
+
 #[cfg(not(feature = "raw"))]
 fn load_raw(path: &Path, _: Vec<u8>) -> Result<Image> {
     Err(no_raw(path))
@@ -207,7 +221,7 @@ impl PictureFile {
     /// RAW, which has no scale.
     pub(super) fn show_as_stored(&self, observer: RowObserver<'_>) -> Result<()> {
         let Self { path, bytes, .. } = self;
-        let pixels = budget::check(path, bytes)?;
+        let pixels = declared::pixels(path, bytes)?;
         if bytes.starts_with(&exr_file::MAGIC) {
             let decoded = decode(self.clone(), Meaning::Number, &Levels::default())?;
             show(&decoded.image, observer);

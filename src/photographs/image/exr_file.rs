@@ -6,7 +6,7 @@ use std::path::Path;
 use exr::meta::attribute::AttributeValue;
 use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableImage};
 
-use super::budget::{self, Permit};
+use super::budget::Permit;
 use super::colour::{self, Chromaticities, Conversion};
 use super::decoded::{DecodedImage, Meaning};
 use super::levels::{Levels, SampleFormat, extremes};
@@ -26,7 +26,7 @@ pub(super) fn load(
     meaning: Meaning,
     levels: &Levels,
 ) -> Result<DecodedImage> {
-    let permit = Permit::wait(budget::exr_bytes(&bytes));
+    let permit = Permit::wait(layer_bytes(&bytes));
     let (mut image, chromaticities) = decoded(path, bytes)?;
     drop(permit);
     let alpha = finite_part(&image);
@@ -108,6 +108,28 @@ fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>
     }
     let (width, height) = (layer.size.width() as u32, layer.size.height() as u32);
     Ok((Image { width, height, data }, chromaticities))
+}
+
+/// What the header of a file says of a layer.
+type ExrHeader = exr::meta::header::Header;
+
+pub(super) fn headers(bytes: &[u8]) -> Option<exr::meta::Headers> {
+    let bytes: Box<dyn BufReadSeek> = Box::new(Cursor::new(bytes));
+    Some(exr::meta::MetaData::read_from_buffered(bytes, false).ok()?.headers)
+}
+
+pub(super) fn size(header: &ExrHeader) -> [u64; 2] {
+    [header.layer_size.width(), header.layer_size.height()].map(|side| side as u64)
+}
+
+/// The bytes of the samples of all layers.
+pub(super) fn layer_bytes(bytes: &[u8]) -> u64 {
+    let samples = |header: &ExrHeader| {
+        let [width, height] = size(header);
+        width.saturating_mul(height).saturating_mul(header.channels.bytes_per_pixel as u64)
+    };
+    let headers = headers(bytes).unwrap_or_default();
+    headers.iter().map(samples).fold(0, u64::saturating_add)
 }
 
 /// What precedes the names of red, green and blue: nothing, or the name of the only group of channels that has all

@@ -21,7 +21,7 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::MIDDLE_GREY;
-use super::codec::PictureFile;
+use super::decode::PictureFile;
 use super::files::is_raw;
 use super::levels::{FoundLevels, Levels, SampleFormat, StoredLight};
 
@@ -116,7 +116,7 @@ impl PhotographLevels {
             for &value in row {
                 (least, most) = (value.min(least), value.max(most));
             }
-            // Every so many values, in the order of the planes.
+            // Values at this distance, in the order of the planes.
             let [width, height, y] = [width, height, y].map(|side| side as usize);
             let step = (3 * width * height / QUANTILES_OF) | 1;
             for (plane, values) in row.chunks_exact(width.max(1)).enumerate() {

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use super::Image;
-use super::{Orientation, codec::PictureFile, reduced_size};
+use super::{Orientation, decode::PictureFile, reduced_size};
 use crate::{Error, Result};
 
 /// A weight for every pixel of an image: 1 if it counts, 0 if it is masked. A pixel that is masked in part is masked.

@@ -153,7 +153,7 @@ impl SpzHeader {
         if self.version == 2 { 3 } else { 4 }
     }
 
-    /// Refuses a file of so many bytes that packs more than a model does.
+    /// Refuses a file of this length that packs more than a model does.
     fn check_ratio(&self, packed: usize) -> Result<(), String> {
         /// Bytes for each byte packed, of models that are not small.
         const MOST: usize = 200;
