@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Campaigns that take too long for tests. Each prints its result; the first that fails ends the script.
 
-    scripts/stress.py [table] [night] [conditioning] [cameras] [long] [kills] [terminals] [fuzz] [guards] [growth]
+    scripts/stress.py [table] [night] [conditioning] [cameras] [long] [kills] [terminals] [bombs] [links] [fuzz]
+                      [guards] [growth]
 
 Without a name, all of them run.
 
@@ -11,14 +12,19 @@ FUZZ_SECONDS         for each fuzz target (600)
 NIGHTSPLAT_SCENES    the scenes of growth, comma-separated; NIGHTSPLAT_DOWNSCALES (4,2,1), NIGHTSPLAT_SEEDS (1,2,3)
 """
 
+import gzip
 import os
 import pty
 import random
+import shutil
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
 import time
+import zipfile
+import zlib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -27,6 +33,8 @@ STEPS = int(os.environ.get("STEPS", "100000"))
 KILLS = int(os.environ.get("KILLS", "200"))
 FUZZ_SECONDS = int(os.environ.get("FUZZ_SECONDS", "600"))
 PLAIN = ["--model", "plain", "--plan", "none", "--curve", "ap3"]
+# What a file that is refused may take: seconds of processor time, and KiB of memory.
+MOST_SECONDS, MOST_MEMORY = 10, 600 * 1024
 # The largest factor by which memory may grow from the second tenth of a run to its last: the allocator's share.
 MOST_GROWTH = 1.05
 
@@ -184,6 +192,92 @@ def wait_for(child, file):
     return False
 
 
+def sparse(path, start, size):
+    """A file that is long on paper alone."""
+    path.write_bytes(start)
+    os.truncate(path, size)
+    return path
+
+
+def png_chunk(kind, data):
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def bombs(folder):
+    """Small files that unpack to gigabytes are refused in a line, soon and in little memory."""
+    def path(name):
+        return folder / name
+
+    def photographs(name, photograph):
+        data = synth(path(name), 16, 5)
+        photograph(next((data / "low").glob("*.png")))
+        return ["train", data, "--out", path("run"), "--steps", 1, "--plan", "none", "--overwrite"]
+
+    def long_iccp(png):
+        whole = png.read_bytes()
+        # In parts: a process counts the memory of the one that started it as its own.
+        packer = zlib.compressobj()
+        packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1 << 10)) + packer.flush()
+        png.write_bytes(whole[:33] + png_chunk(b"iCCP", b"p\0\0" + packed) + whole[33:])
+
+    with zipfile.ZipFile(path("deep.zip"), "w") as archive:
+        archive.writestr("a/" * 16_000 + "x", "")
+    head = b"ply\nformat binary_little_endian 1.0\n"
+    sparse(path("endless.ply"), head + b"comment ", 6 << 30)
+    many = "".join(f"property float p{index}\n" for index in range(200_000))
+    path("wide.ply").write_bytes(head + b"element vertex 1\n" + many.encode() + b"end_header\n")
+    spz = struct.pack("<IIIBBBB", 0x5053474E, 3, 40_000_000, 0, 12, 0, 0)
+    with gzip.open(path("zeros.spz"), "wb") as file:
+        file.write(spz)
+        for _ in range(900):
+            file.write(bytes(1 << 20))
+    cases = {
+        "an archive of 16 000 folders": ["train", path("deep.zip"), "--out", path("run")],
+        "an endless header": ["export", path("endless.ply"), "--format", "spz", "--out", path("out.spz")],
+        "200 000 properties": ["export", path("wide.ply"), "--format", "spz", "--out", path("out.spz")],
+        "an SPZ of zeros": ["export", path("zeros.spz"), "--format", "ply", "--out", path("out.ply")],
+        "a photograph of 3 GB": photographs("false", lambda png: sparse(png, b"", 3 << 30)),
+        "a profile of 1 GB": photographs("profile", long_iccp),
+    }
+    for name, arguments in cases.items():
+        child = subprocess.Popen([command(), *map(str, arguments)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        lines = child.stderr.read().decode().splitlines()
+        _, status, usage = os.wait4(child.pid, 0)
+        code, seconds = os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime
+        took = f"{seconds:.1f} s of processor time, {usage.ru_maxrss // 1024} MiB"
+        # Of a set with a bad photograph the others are trained on.
+        told = [line for line in lines if line.startswith("error: " if code else " WARN ")]
+        print(f"{name}: exit code {code}, {took}: {told[:1]}")
+        if not told or seconds > MOST_SECONDS or usage.ru_maxrss > MOST_MEMORY:
+            sys.exit("it was not refused as it should be")
+
+
+def links(folder):
+    """Links planted in a run or beside an output decide nothing about other files."""
+    data, precious = synth(folder / "set", 16, 5), folder / "precious"
+    train = [command(), "train", data, "--out", folder / "run", "--steps", 2, *PLAIN]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    run(*train, **quiet)
+    names = [file.name for file in (folder / "run").iterdir() if file.is_file()]
+    for name in [name + end for name in names for end in ("", ".partial")] + [".lock"]:
+        shutil.copytree(folder / "run", folder / "planted")
+        precious.write_text("precious")
+        (folder / "planted" / name).unlink(missing_ok=True)
+        (folder / "planted" / name).symlink_to(precious)
+        arguments = [str(one) for one in train + ["--overwrite"]]
+        arguments[arguments.index(str(folder / "run"))] = str(folder / "planted")
+        subprocess.run(arguments, **quiet)
+        if precious.read_text() != "precious":
+            sys.exit(f"a link named {name} led out of the run")
+        shutil.rmtree(folder / "planted")
+    model, out = folder / "run" / "model.ply", folder / "out.spz"
+    (folder / "out.spz.partial").symlink_to(precious)
+    run(command(), "export", model, "--format", "spz", "--out", out, **quiet)
+    if precious.read_text() != "precious" or out.is_symlink():
+        sys.exit("a link beside an output was followed")
+    print(f"{2 * len(names) + 2} planted links: none was followed")
+
+
 def fuzz(_):
     """Every parser, FUZZ_SECONDS each."""
     run(ROOT / "scripts" / "fuzz.sh", FUZZ_SECONDS)
@@ -202,7 +296,7 @@ def growth(_):
     run("cargo", "test", "--release", "--lib", "--", "--ignored", "--nocapture", "no_round_of_a_real_scene")
 
 
-ALL = (table, night, conditioning, cameras, long, kills, terminals, fuzz, guards, growth)
+ALL = (table, night, conditioning, cameras, long, kills, terminals, bombs, links, fuzz, guards, growth)
 CAMPAIGNS = {campaign.__name__: campaign for campaign in ALL}
 
 

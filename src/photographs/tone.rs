@@ -81,7 +81,7 @@ pub(crate) use self::settings::OF_CURVE;
 #[cfg(feature = "io")]
 pub use self::settings::{GainChoice, ToneSettings};
 #[cfg(feature = "io")]
-pub use self::statistics::{Statistics, percentile};
+pub use self::statistics::{Statistics, percentiles};
 #[cfg(feature = "io")]
 pub(crate) use self::statistics::{luminance, measurable};
 #[cfg(feature = "io")]

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use nightsplat::Error;
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::tone::{
-    GainChoice, Statistics, Tone, ToneCurve, ToneParameters, ToneSettings, percentile,
+    GainChoice, Statistics, Tone, ToneCurve, ToneParameters, ToneSettings, percentiles,
 };
 
 use crate::common::{fixture, shared};
@@ -176,16 +176,19 @@ fn settings_that_leave_a_curve_undefined_are_refused() {
 
 #[test]
 fn percentiles_interpolate_between_the_neighbours_of_the_rank() {
-    assert_eq!(percentile(&mut [3.0, 1.0], 1), 1.2);
-    assert_eq!(percentile(&mut [5.0], 9), 5.0);
-    assert_eq!(percentile(&mut [], 9), 0.0);
+    assert_eq!(percentiles(&mut [3.0, 1.0], [1]), [1.2]);
+    assert_eq!(percentiles(&mut [5.0], [1, 9]), [5.0; 2]);
+    assert_eq!(percentiles(&mut [], [9]), [0.0]);
     let mut state = 7;
     for count in [2, 3, 9, 10, 11, 12, 20, 21, 1001, 4096] {
         let values: Vec<f32> = (0..count).map(|_| noise(&mut state)).collect();
-        for tenths in [0, 1, 5, 9, 10] {
+        let tenths = [0, 1, 5, 9, 9, 10];
+        for (tenths, found) in tenths.into_iter().zip(percentiles(&mut values.clone(), tenths)) {
             let exact = sorted_quantile(&values, tenths as f64 / 10.0);
-            let found = f64::from(percentile(&mut values.clone(), tenths));
-            assert!((found - exact).abs() < 1e-7, "{tenths} / 10 of {count}: {found}, not {exact}");
+            assert!(
+                (f64::from(found) - exact).abs() < 1e-7,
+                "{tenths} / 10 of {count}: {found}, not {exact}"
+            );
         }
     }
 }

@@ -107,20 +107,19 @@ fn a_failed_export_is_one_line_and_leaves_no_file() {
         &["x.spz is a file of --format spz, not of --format html"],
     );
     refused(
-        &format!("export {run} --format glb --out {root}/none/a.glb"),
+        &format!("export {run} --format glb --out {run}/model.ply/a.glb"),
         1,
-        &["a.glb", "cannot be written"],
+        &["model.ply", "cannot be created"],
     );
     // A full disk, if there is a device that simulates one.
     if Path::new("/dev/full").exists() {
-        let full = folder.path().join("full.glb.partial");
-        std::os::unix::fs::symlink("/dev/full", &full).unwrap();
+        std::os::unix::fs::symlink("/dev/full", folder.path().join("full.glb")).unwrap();
         refused(
             &format!("export {run} --format glb --out {root}/full.glb"),
             1,
             &["full.glb", "disk"],
         );
-        assert!(!folder.path().join("full.glb").exists());
+        assert!(!folder.path().join("full.glb.partial").exists());
     }
     std::fs::remove_file(Path::new(&run).join("model.ply")).unwrap();
     refused(&format!("export {run} --format spz"), 3, &["no model.ply"]);

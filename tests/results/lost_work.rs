@@ -311,7 +311,7 @@ fn hostile_names_break_no_table_and_reach_no_terminal() {
     );
     let log = fs::read_to_string(workspace.path("run/train.csv")).unwrap();
     assert_eq!(log.lines().count(), 10);
-    assert!(log.contains("\"a,_[31mb\""), "{log}");
+    assert!(log.contains(r#""a,\u{1b}[31mb""#), "{log}");
     refused("eval /nowhere\u{1b}[2J", 3, &[r"/nowhere\u{1b}[2J"]);
 }
 

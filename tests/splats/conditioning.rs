@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3};
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
-use nightsplat::photographs::tone::{Statistics, percentile};
+use nightsplat::photographs::tone::{Statistics, percentiles};
 use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::gaussian::Gaussian;
@@ -261,7 +261,7 @@ fn percentiles_and_means_of_more_than_sixteen_million_pixels_are_exact() {
     assert!(weight > 0.0, "the percentile lies between two ranks");
     let plane = (0..pixels).map(|i| if pixels - 1 - i <= lower { 0.25 } else { 0.5 });
     let mut luminances: Vec<f32> = plane.collect();
-    assert_eq!(percentile(&mut luminances, 8), 0.25 + 0.25 * weight);
+    assert_eq!(percentiles(&mut luminances, [8]), [0.25 + 0.25 * weight]);
     let statistics = Statistics::new(&luminances.repeat(3));
     let mean = 0.25 * (1.0 + (pixels - 1 - lower) as f64 / pixels as f64);
     for found in [statistics.mean, statistics.mean_luminance] {

@@ -29,9 +29,8 @@ pub struct LuminanceHistogram {
 /// A channel whose sum is less than this fraction of the largest is empty.
 pub(crate) const EMPTY_CHANNEL: f64 = 0.03;
 
-/// For each channel itself, or the brightest one if it is empty: an image intensifier fills green alone.
-fn filled_channels(planes: [&[f32]; 3]) -> [usize; 3] {
-    let sums = planes.map(|plane| plane.iter().map(|&x| f64::from(measurable(x))).sum::<f64>());
+/// For each channel itself, or the brightest one if its sum makes it empty: an image intensifier fills green alone.
+fn filled_channels(sums: [f64; 3]) -> [usize; 3] {
     let brightest = (0..3).fold(0, |most, at| if sums[at] > sums[most] { at } else { most });
     let is_empty = |at: usize| sums[at] < EMPTY_CHANNEL * sums[brightest];
     [0, 1, 2].map(|at| if is_empty(at) { brightest } else { at })
@@ -42,16 +41,28 @@ impl LuminanceHistogram {
     /// empty channel counts as the brightest.
     pub fn new(planes: &[f32]) -> Self {
         let (red, rest) = planes.split_at(planes.len() / 3);
-        let (green, blue) = rest.split_at(red.len());
-        let filled = filled_channels([red, green, blue]);
+        let planes = [red, &rest[..red.len()], &rest[red.len()..]];
+        let (histogram, sums) = Self::counted(planes);
+        let filled = filled_channels(sums);
+        if filled == [0, 1, 2] {
+            return histogram;
+        }
+        let has_colour = filled.iter().any(|channel| *channel != filled[0]);
+        Self { has_colour, ..Self::counted(filled.map(|channel| planes[channel])).0 }
+    }
+
+    /// The histogram of planes none of which is empty, and their sums.
+    fn counted([red, green, blue]: [&[f32]; 3]) -> (Self, [f64; 3]) {
         let mut counts = vec![0_u32; BINS];
-        let (mut chroma, mut value) = (0.0, 0.0);
+        let (mut chroma, mut value, mut sums) = (0.0, 0.0, [0.0; 3]);
         for ((&r, &g), &b) in red.iter().zip(green).zip(blue) {
-            let rgb = filled.map(|channel| measurable([r, g, b][channel]));
-            let [red, green, blue] = rgb;
-            let most = red.max(green).max(blue);
-            chroma += f64::from(most - red.min(green).min(blue));
+            let rgb = [measurable(r), measurable(g), measurable(b)];
+            let most = rgb[0].max(rgb[1]).max(rgb[2]);
+            chroma += f64::from(most - rgb[0].min(rgb[1]).min(rgb[2]));
             value += f64::from(most);
+            for (sum, x) in sums.iter_mut().zip(rgb) {
+                *sum += f64::from(x);
+            }
             let number = luminance(rgb).to_bits() >> BIN_SHIFT;
             let bin = number.checked_sub(FIRST_BIN);
             if let Some(count) = bin.and_then(|bin| counts.get_mut(bin as usize)) {
@@ -61,8 +72,7 @@ impl LuminanceHistogram {
         let bins = (0..).zip(counts).filter(|(_, count)| *count > 0);
         let counts: Vec<(u32, u64)> = bins.map(|(bin, count)| (bin, count.into())).collect();
         let lit: u64 = counts.iter().map(|(_, count)| count).sum();
-        let has_colour = filled.iter().any(|channel| *channel != filled[0]);
-        Self { black: red.len() as u64 - lit, counts, chroma, value, has_colour }
+        (Self { black: red.len() as u64 - lit, counts, chroma, value, has_colour: true }, sums)
     }
 
     /// Whether only one channel has light, as that of an image intensifier.

@@ -37,10 +37,11 @@ impl Statistics {
             }
         }
         let [red, green, blue] = sums.map(|sum| sum / luminances.len().max(1) as f64);
+        let [p10, p80, p90] = percentiles(&mut luminances, [1, 8, 9]).map(|value| value + EPSILON);
         Self {
-            p10: percentile(&mut luminances, 1) + EPSILON,
-            p80: percentile(&mut luminances, 8) + EPSILON,
-            p90: percentile(&mut luminances, 9) + EPSILON,
+            p10,
+            p80,
+            p90,
             mean_luminance: (0.299 * red + 0.587 * green + 0.114 * blue) as f32,
             mean: ((red + green + blue) / 3.0) as f32,
             channel_means: [red, green, blue].map(|mean| mean as f32),
@@ -93,13 +94,19 @@ pub(crate) fn measurable(x: f32) -> f32 {
     if x > 0.0 { x.min(65504.0) } else { 0.0 }
 }
 
-/// The `tenths` / 10 quantile of non-negative values, linear between the two neighbours of its rank as in
-/// `torch.quantile`; reorders the values. 0 without values.
-pub fn percentile(values: &mut [f32], tenths: usize) -> f32 {
-    let Some(last) = values.len().checked_sub(1) else { return 0.0 };
-    // The rank q (n - 1) is split in integers: in f32 it is inexact beyond 2^24 values.
-    let (rank, weight) = (tenths * last / 10, (tenths * last % 10) as f32 / 10.0);
-    let (_, &mut lower, above) = values.select_nth_unstable_by(rank, f32::total_cmp);
-    let upper = above.iter().copied().min_by(f32::total_cmp).unwrap_or(lower);
-    lower + weight * (upper - lower)
+/// The `tenths` / 10 quantiles of non-negative values, in ascending order, each linear between the two neighbours of its
+/// rank as in `torch.quantile`; reorders the values. 0 without values.
+pub fn percentiles<const N: usize>(values: &mut [f32], tenths: [usize; N]) -> [f32; N] {
+    let Some(last) = values.len().checked_sub(1) else { return [0.0; N] };
+    // Values of lower ranks are before this one.
+    let mut from = 0;
+    tenths.map(|tenths| {
+        // The rank q (n - 1) is split in integers: in f32 it is inexact beyond 2^24 values.
+        let (rank, weight) = (tenths * last / 10, (tenths * last % 10) as f32 / 10.0);
+        let rest = &mut values[from..];
+        let (_, &mut lower, above) = rest.select_nth_unstable_by(rank - from, f32::total_cmp);
+        let upper = above.iter().copied().min_by(f32::total_cmp).unwrap_or(lower);
+        from = rank;
+        lower + weight * (upper - lower)
+    })
 }

@@ -195,7 +195,7 @@ fn a_failure_of_colmap_is_reported_in_a_line_and_leaves_no_dataset() {
     for (cases, parts) in [
         (
             "feature_extractor) echo first; echo; echo no such camera >&2; exit 3;;",
-            &["feature_extractor ended with", "3: first | no such camera"][..],
+            &["feature_extractor ended with", "3: no such camera"][..],
         ),
         (
             "exhaustive_matcher) kill -9 $$;;",
