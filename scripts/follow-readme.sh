@@ -2,7 +2,7 @@
 # Runs every command of README.md's `sh` blocks, in order, in a copy of this checkout; `cargo install` goes first. A
 # command to skip is named in a comment of the README, `<!-- follow: ... -->`, and printed as `not run`.
 #
-#     scripts/follow-readme.sh [NIGHTSPLAT]      with a program, nothing is installed, and the demo runs with it
+#     scripts/follow-readme.sh [NIGHTSPLAT]      with a program, nothing is installed, and a shorter demo runs with it
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
@@ -35,7 +35,7 @@ photograph() {
 follow() {
     case ${program:+with }$1 in
     "with cargo install"*) return ;;
-    "with make demo"*) set -- "nightsplat demo --out demo" ;;
+    "with make demo"*) set -- "nightsplat demo --out demo --steps 60" ;;
     esac
     case $1 in
     "make test"* | podman*)

@@ -371,7 +371,7 @@ fn demo_changes_no_foreign_folder() {
 #[test]
 fn demo_is_a_sweep_of_four_curves_that_continues_and_links_the_model() {
     let folder = tempfile::tempdir().unwrap();
-    let demo = format!("demo --out {} --steps 60", folder.path().display());
+    let demo = format!("demo --out {} --steps 20", folder.path().display());
     let table = succeed(&demo);
     for curve in ["auto", "linear", "ase", "ap3"] {
         assert!(folder.path().join(format!("curve={curve}/model.ply")).is_file(), "{table}");

@@ -22,7 +22,6 @@ pub(super) struct SsimLoss {
 /// The kernels for the device. On a CPU, loads and stores cost most, and the state of both blurs fits the L1 cache. On
 /// a GPU it would take most registers of a processor, so that too few subgroups would be left to hide latencies.
 #[derive(Debug)]
-#[expect(clippy::large_enum_variant, reason = "a training has one")]
 enum SsimKernels {
     One(StripKernels),
     Two {

@@ -1,7 +1,7 @@
 //! Image files: reads PNG, JPEG, WebP, TIFF and EXR, writes PNG, JPEG and EXR.
 
 use std::io::{BufReader, Cursor};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use ::image::codecs::{jpeg::JpegEncoder, png::PngEncoder};
 use ::image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader};
@@ -307,6 +307,8 @@ fn raw_size(path: &Path, _: Vec<u8>) -> Result<(u32, u32)> {
 
 #[cfg(test)]
 mod tests {
+    use std::path::PathBuf;
+
     use ::image::{ImageBuffer, Luma, LumaA, Rgb, Rgba};
 
     use super::super::tests::{gradient, worst};
