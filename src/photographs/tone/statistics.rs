@@ -94,8 +94,8 @@ pub(crate) fn measurable(x: f32) -> f32 {
     if x > 0.0 { x.min(65504.0) } else { 0.0 }
 }
 
-/// The `tenths` / 10 quantiles of non-negative values, in ascending order, each linear between the two neighbours of its
-/// rank as in `torch.quantile`; reorders the values. 0 without values.
+/// The `tenths` / 10 quantiles of non-negative values, in ascending order, each linear between the two neighbours of
+/// its rank as in `torch.quantile`; reorders the values. 0 without values.
 pub fn percentiles<const N: usize>(values: &mut [f32], tenths: [usize; N]) -> [f32; N] {
     let Some(last) = values.len().checked_sub(1) else { return [0.0; N] };
     // Values of lower ranks are before this one.

@@ -171,9 +171,9 @@ fn every_bad_model_is_refused_by_code_and_name() {
     std::fs::write(folder.join("cut.ply"), &bytes[..bytes.len() - 100]).unwrap();
     load(&folder.join("cut.ply"), NSP_ERROR_INPUT, &["cut.ply"]);
     let mut broken = gaussians(0);
-    broken.means_mut()[7] = Vec3::NAN;
+    broken.means_mut().fill(Vec3::NAN);
     broken.save(folder.join("nan.ply")).unwrap();
-    load(&folder.join("nan.ply"), NSP_ERROR_INPUT, &["nan.ply", "finite"]);
+    load(&folder.join("nan.ply"), NSP_ERROR_INPUT, &["nan.ply", "NaN"]);
     // SAFETY: NULL and the rest are refused.
     unsafe {
         let result = nsp_model_load(device, null(), &mut model);
