@@ -222,11 +222,12 @@ fn blocks_that_are_missing_unfinished_or_of_another_plan_are_refused_by_name() {
     });
 }
 
-/// A file that is written under this path meets a full disk.
+/// A file cannot be written under this path, as on a full disk. Returns its temporary name, which is taken.
 #[cfg(target_os = "linux")]
-fn fill_the_disk_for(path: &Path) {
-    let _ = fs::remove_file(path);
-    std::os::unix::fs::symlink("/dev/full", path).unwrap();
+fn block(path: &Path) -> PathBuf {
+    let partial = PathBuf::from(format!("{}.partial", path.display()));
+    fs::create_dir(&partial).unwrap();
+    partial
 }
 
 #[cfg(target_os = "linux")]
@@ -244,10 +245,10 @@ fn a_full_disk_stops_a_join_with_one_line_and_leaves_no_manifest_until_there_is_
                 fs::remove_dir_all(&model).unwrap();
                 fs::create_dir_all(model.join("0")).unwrap();
             }
-            fill_the_disk_for(&folder.join(file));
+            let partial = block(&folder.join(file));
             let blocked = folder.join(file).display().to_string();
             refused(&join, 1, &[&blocked, "cannot be written", "check the folder and the disk"]);
-            fs::remove_file(folder.join(file)).unwrap();
+            fs::remove_dir(partial).unwrap();
             assert!(!model.join("manifest.json").exists(), "{file}: half a model with a manifest");
             // No command takes it for a model.
             refused(&format!("eval {}", folder.display()), 3, &[&folder.display().to_string()]);

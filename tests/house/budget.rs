@@ -37,7 +37,7 @@ const BUDGET: &[(&str, usize, &str)] = &[
         "The trainer and its settings, diagnosis and plan; fall-off, bands of lamps; detail of a score.",
     ),
     ("src", 944, "Files without a folder: the list of modules, the self-test."),
-    ("tests", 31169, "What no unit test of a file can show."),
+    ("tests", 31170, "What no unit test of a file can show."),
     ("shaders-glsl", 6050, "The kernels."),
     ("scripts", 5337, "Measurements, packages, checks against other programs."),
     ("docs", 2015, "What users and contributors read."),

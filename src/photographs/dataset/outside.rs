@@ -27,8 +27,8 @@ pub(super) fn remark(
     let first = outside.first()?.display();
     let count = outside.len();
     Some(format!(
-        "{count} photographs of the dataset lie outside of its folder, {first} the first: pages and renders show them; \
-         `--images DIR` says where they are meant to lie"
+        "photographs that lie outside of the dataset's folder: {count}, {first} the first; pages and renders show \
+         them; `--images DIR` says where they are meant to lie"
     ))
 }
 
@@ -68,7 +68,7 @@ mod tests {
         assert!(outside(remarks(&root, &["a.png".into()], &options)).is_empty());
         let files = ["a.png".into(), "c.png".into(), other.join("b.png")];
         let lines = outside(remarks(&root, &files, &options));
-        assert!(lines.len() == 1 && lines[0].starts_with("2 photographs"), "{lines:?}");
+        assert!(lines.len() == 1 && lines[0].contains("folder: 2, "), "{lines:?}");
         let meant = LoadOptions { images: Some(other), ..options };
         assert!(outside(remarks(&root, &["b.png".into()], &meant)).is_empty());
     }
