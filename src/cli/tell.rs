@@ -26,7 +26,7 @@ pub(super) fn tell(text: impl Display) {
     let _ = write(std::io::stdout().lock(), &text);
 }
 
-/// [`tell`] on standard error.
+/// Tells on standard error. No failure ends a command.
 pub fn tell_on_stderr(text: impl Display) {
     let _ = write(std::io::stderr().lock(), &text);
 }
