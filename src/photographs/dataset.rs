@@ -157,9 +157,7 @@ impl Dataset {
             select(&layout, options, &files)?;
         log_split(&layout.root, has_split, options);
         let mut sources = sources(&layout.root, &frames, options, &files, &mut skipped);
-        let masks = sources.iter_mut().filter_map(|source| source.mask.as_mut());
-        remarks.extend(MaskFile::find_labels(masks));
-        remarks.extend(outside::remark(&layout, &sources, options));
+        remarks.extend(check_files(&layout, &mut sources, options));
         let headers = pixels::headers(&mut sources, options);
         let mut levels = levels(&layout, &sources, options, &files)?;
         let balance = white_balance_matrix(&layout.root, &sources, options, levels)?;
@@ -280,9 +278,7 @@ impl Dataset {
         let layout = DatasetLayout::detect(root)?;
         let Listing { frames, mut skipped, mut remarks, .. } = select(&layout, options, &files)?;
         let mut sources = sources(&layout.root, &frames, options, &files, &mut skipped);
-        let masks = sources.iter_mut().filter_map(|source| source.mask.as_mut());
-        remarks.extend(MaskFile::find_labels(masks));
-        remarks.extend(outside::remark(&layout, &sources, options));
+        remarks.extend(check_files(&layout, &mut sources, options));
         let photograph = |source: ViewFiles| {
             let ViewFiles { name, split, input, reference, mask, .. } = source;
             Some(Photograph { name, split, input: input?, reference, mask })
@@ -322,6 +318,17 @@ fn white_balance_matrix(
     };
     let balance = |balance: &WhiteBalance| balance.matrix(root, photographs(), levels);
     options.white_balance.as_ref().map(balance).transpose()
+}
+
+/// Marks masks of labels; returns remarks on masks, and on photographs outside of the dataset.
+fn check_files(
+    layout: &DatasetLayout,
+    sources: &mut [ViewFiles],
+    options: &LoadOptions,
+) -> impl Iterator<Item = String> {
+    let masks = sources.iter_mut().filter_map(|source| source.mask.as_mut());
+    let labels = MaskFile::find_labels(masks);
+    labels.into_iter().chain(outside::remark(layout, sources, options))
 }
 
 /// The files of each view. A training view without its photograph is left out, a test view is kept as a pose.

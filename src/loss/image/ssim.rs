@@ -91,14 +91,14 @@ fn layout_of(size: UVec2) -> usize {
 impl StripKernels {
     fn kernel(&mut self, size: UVec2) -> Result<&Pipeline<ssim::Kernel>> {
         let index = layout_of(size);
-        let compiled = match self.compiled[index].take() {
-            Some(kernel) => kernel,
-            None => {
+        match &mut self.compiled[index] {
+            Some(kernel) => Ok(kernel),
+            missing => {
                 let SsimLayout { columns, rows, alignment } = LAYOUTS[index];
-                self.gpu.pipeline(&ssim::Constants { columns, rows, alignment, adds: self.adds })?
+                let constants = ssim::Constants { columns, rows, alignment, adds: self.adds };
+                Ok(missing.insert(self.gpu.pipeline(&constants)?))
             }
-        };
-        Ok(self.compiled[index].insert(compiled))
+        }
     }
 }
 

@@ -26,8 +26,8 @@ pub struct Original {
     undistort: bool,
     /// The rotation from the stored pixels to those of the camera.
     orientation: Orientation,
-    /// The size that it is decoded at.
-    decoded_size: Option<(u32, u32)>,
+    /// The size that it is decoded at, if that is not its own.
+    pub(super) decoded_size: Option<(u32, u32)>,
     /// Levels of a photograph's file.
     pub(super) levels: Levels,
     /// The size that a photograph of linear light is shrunk to before it is tone-mapped.
@@ -45,18 +45,13 @@ pub struct Original {
 }
 
 impl Original {
-    pub(super) fn new(
-        (path, decoded_size): (PathBuf, Option<(u32, u32)>),
-        lens: Lens,
-        undistort: bool,
-        turns: Turns,
-    ) -> Self {
+    pub(super) fn new(path: PathBuf, lens: Lens, undistort: bool, turns: Turns) -> Self {
         Self {
             path,
             lens,
             undistort,
             orientation: turns.loading,
-            decoded_size,
+            decoded_size: None,
             levels: Levels::default(),
             light_size: None,
             balance: None,

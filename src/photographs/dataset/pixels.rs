@@ -348,6 +348,15 @@ struct DecodedPicture {
     decoded_size: Option<(u32, u32)>,
 }
 
+impl DecodedPicture {
+    /// Its file, to be read again.
+    fn original(&self, lens: &Lens, undistort: bool) -> Original {
+        let mut original = Original::new(self.path.clone(), *lens, undistort, self.turns);
+        original.decoded_size = self.decoded_size;
+        original
+    }
+}
+
 /// The pixels of a photograph or reference image as loaded, and its file if these are not all of it.
 type InMemory = (Option<Image>, Option<Original>);
 
@@ -402,10 +411,8 @@ impl ViewLoader<'_> {
         let mask = Mask::masked_at(mask.transpose()?.flatten(), preparation.size, unseen);
         let brightness = [&photograph, &reference]
             .map(|decoded| decoded.as_ref().map(|decoded| mean(&decoded.image)));
-        let reference_original = reference.as_ref().map(|decoded| {
-            let file = (decoded.path.clone(), decoded.decoded_size);
-            Original::new(file, *preparation.lens, options.undistort, decoded.turns)
-        });
+        let reference_original =
+            reference.as_ref().map(|decoded| decoded.original(preparation.lens, options.undistort));
         let is_hidden = mask.as_ref().is_some_and(Mask::hides_all);
         if is_hidden {
             problems.push(match file_that_hides {
@@ -479,7 +486,8 @@ impl ViewLoader<'_> {
     ) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
-        let DecodedPicture { path, image, turns, is_light, decoded_size, .. } = decoded;
+        let mut original = decoded.original(preparation.lens, options.undistort);
+        let DecodedPicture { path, image, turns, is_light, .. } = decoded;
         let whole = preparation.photograph(image.turned(turns.loading), &path, options.falloff)?;
         let whole = if is_light { preparation.shrunk_in_light(whole) } else { whole };
         let is_shrunk = preparation.size != (whole.width, whole.height);
@@ -487,8 +495,6 @@ impl ViewLoader<'_> {
         if is_kept && !is_shrunk {
             return Ok((Some(whole), None));
         }
-        let file = (path, decoded_size);
-        let mut original = Original::new(file, *preparation.lens, options.undistort, turns);
         (original.balance, original.falloff) = (loading.balance, options.falloff);
         original.levels = loading.colours[0].levels();
         original.light_size = is_light.then_some(preparation.size);
@@ -521,12 +527,11 @@ impl ViewLoader<'_> {
 
     fn reference_image(&self, decoded: DecodedPicture) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
-        let DecodedPicture { path, image, turns, decoded_size, .. } = decoded;
         if loading.options.keep == Some(0) {
-            let undistort = loading.options.undistort;
-            let file = Original::new((path, decoded_size), *preparation.lens, undistort, turns);
-            return Ok((None, Some(file)));
+            let original = decoded.original(preparation.lens, loading.options.undistort);
+            return Ok((None, Some(original)));
         }
+        let DecodedPicture { path, image, turns, .. } = decoded;
         Ok((Some(preparation.loaded(image.turned(turns.loading), &path)?), None))
     }
 }
