@@ -4,10 +4,6 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-#[path = "../src/base/hash.rs"]
-#[allow(dead_code, unreachable_pub, reason = "the crate sees more of the module than the build")]
-mod hash;
-
 pub(crate) const FOLDER: &str = "precompiled";
 
 /// What the compiled kernels depend on: the shaders, the table that they include, and what compiles them.
@@ -49,7 +45,13 @@ pub(crate) fn copy(out_dir: &Path) -> Result<(), String> {
 }
 
 fn hash_of_sources() -> String {
-    let mut hasher = hash::Hasher::default();
+    // FNV-1a, which tells accidental changes.
+    let mut hash = 0xCBF2_9CE4_8422_2325_u64;
+    let mut write = |bytes: &[u8]| {
+        for byte in bytes {
+            hash = (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01B3);
+        }
+    };
     for source in SOURCES {
         for path in files(Path::new(source)) {
             // Windows writes paths and lines otherwise.
@@ -57,11 +59,11 @@ fn hash_of_sources() -> String {
             let bytes = fs::read(&path).unwrap_or_default();
             let text = String::from_utf8_lossy(&bytes).replace("\r\n", "\n");
             let text = if source == "Cargo.lock" { compilers(&text) } else { text };
-            hasher.write(name.as_bytes());
-            hasher.write(text.as_bytes());
+            write(name.as_bytes());
+            write(text.as_bytes());
         }
     }
-    hash::text(hasher.finish())
+    format!("{hash:016x}")
 }
 
 /// The names and versions of the packages that compile.

@@ -5,10 +5,19 @@ use std::fmt::Write as _;
 use super::glsl::{self, Text};
 use super::reflection::{Buffer, Constant, Field, Kernel, Struct, Structs};
 
+/// The struct that measurements on the host fill; here only its layout is checked.
+const OF_CORE: &str = "ToneParameters";
+
 impl Structs {
     /// The structs that kernels share, with what `text` says of them.
     pub(crate) fn write(&self, text: &Text) -> String {
         let write = |(declared, _): &(Struct, String)| {
+            if declared.name == OF_CORE {
+                return format!(
+                    "pub use nightsplat_core::curves::{OF_CORE};\n{}",
+                    declared.layout()
+                );
+            }
             let docs = format!("/// `{}` as the shaders' includes declare it.", declared.name);
             format!("{docs}\n{}", declared.write(text))
         };
@@ -18,23 +27,29 @@ impl Structs {
 
 impl Struct {
     fn write(&self, text: &Text) -> String {
-        let Self { name, fields, size } = self;
+        let Self { name, fields, .. } = self;
+        let layout = self.layout();
         let members: String = fields.iter().map(|field| member(text, name, field)).collect();
+        format!(
+            "#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+pub struct {name} {{
+{members}}}
+{layout}
+"
+        )
+    }
+
+    /// Checks of its layout.
+    fn layout(&self) -> String {
+        let Self { name, fields, size } = self;
         let offsets: String = fields
             .iter()
             .map(|Field { name: field, offset, .. }| {
                 format!("const _: () = assert!(offset_of!({name}, {field}) == {offset});\n")
             })
             .collect();
-        format!(
-            "#[repr(C)]
-#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
-pub struct {name} {{
-{members}}}
-{offsets}const _: () = assert!(size_of::<{name}>() == {size});
-
-"
-        )
+        format!("{offsets}const _: () = assert!(size_of::<{name}>() == {size});\n")
     }
 }
 
@@ -150,18 +165,18 @@ pub struct Buffers<'a> {{
 {device}}}
 
 /// The same buffers in host memory, for the CPU reference.
-#[cfg(feature = "check")]
+#[cfg(feature = "train")]
 #[derive(Debug)]
 pub struct Slices<'a> {{
 {host}}}
 
 /// How far each buffer that it writes may be from the reference's.
-#[cfg(feature = "check")]
+#[cfg(feature = "train")]
 #[derive(Clone, Debug, Default)]
 pub struct Tolerances {{
 {tolerances}}}
 
-#[cfg(feature = "check")]
+#[cfg(feature = "train")]
 impl From<Tolerances> for Vec<gpu::Tolerance> {{
     fn from(tolerances: Tolerances) -> Self {{ vec![{listed}] }}
 }}
@@ -182,7 +197,7 @@ impl gpu::Kernel for Kernel {{
     fn bound(buffers: &Buffers<'_>) -> Vec<gpu::Bound> {{ vec![{bound}] }}
 }}
 
-#[cfg(feature = "check")]
+#[cfg(feature = "train")]
 impl gpu::OnHost for Kernel {{
     type Slices<'a> = Slices<'a>;
     type Tolerances = Tolerances;

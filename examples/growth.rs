@@ -10,16 +10,16 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use nightsplat::base::random::Stream;
 use nightsplat::cli::bench::scene::{self, BenchScene};
 use nightsplat::gpu::{DeviceChoice, Gpu, PassTime};
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::photographs::dataset::{Dataset, Point};
 use nightsplat::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::{Features, MAX_SH_DEGREE, Shape};
 use nightsplat::train::diagnose::Diagnosis;
 use nightsplat::train::{TrainConfig, Trainer};
 use nightsplat::{Error, Result};
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::dataset::{Dataset, Point};
+use nightsplat_synth::SyntheticOptions;
 use tempfile::TempDir;
 
 /// Factors of the scene's number of Gaussians.
@@ -162,7 +162,7 @@ fn capture(views: usize) -> Result<TempDir> {
     let folder = tempfile::tempdir()
         .map_err(|error| Error::Usage(format!("a temporary folder cannot be created: {error}")))?;
     let options = SyntheticOptions { views, width: 48, height: 36, ..SyntheticOptions::default() };
-    synthetic::write(folder.path(), &options)?;
+    nightsplat_synth::write(folder.path(), &options)?;
     Ok(folder)
 }
 

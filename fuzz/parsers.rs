@@ -5,13 +5,11 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use nightsplat::Result;
-use nightsplat::photographs::dataset::{Dataset, LoadOptions};
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::tone::{Profile, ToneSettings};
-use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::ply;
-use nightsplat::train::{TrainConfig, check_checkpoint};
+use nightsplat::train::check_checkpoint;
+use nightsplat::{
+    Dataset, Image, ImageFile, LoadOptions, Model, Profile, Result, ToneSettings, TrainConfig,
+};
 
 /// A parser, by the name of its fuzz target and of its folder of seeds.
 pub(crate) type Parser = (&'static str, fn(&[u8]));

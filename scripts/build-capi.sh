@@ -5,7 +5,7 @@
 #   DIR/lib/libnightsplat.so -> libnightsplat.so.0, and libnightsplat.a
 #   DIR/lib/pkgconfig/nightsplat.pc, DIR/lib/cmake/nightsplat/nightsplat-config.cmake
 #
-# Without options it is a renderer; `--features io` adds training and the formats beside PLY. From a checkout the
+# Without options it is a renderer; `--features train` adds training and the formats beside PLY. From a checkout the
 # kernels are compiled, which needs C++; an archive holds them compiled.
 set -euo pipefail
 
@@ -20,10 +20,10 @@ cd "$(dirname "$0")/.."
 
 profile=${NIGHTSPLAT_PROFILE:-release}
 # A checkout may hold the kernels of an earlier package.
-features=capi,glslang
-[ -e .git ] || [ ! -d precompiled ] || features=capi
+features=glslang
+[ -e .git ] || [ ! -d precompiled ] || features=
 built=${CARGO_TARGET_DIR:-target}/$([ "$profile" = dev ] && echo debug || echo "$profile")
-options=(--profile "$profile" --lib --no-default-features --features "$features" "$@")
+options=(-p nightsplat-capi --profile "$profile" --lib --no-default-features --features "$features" "$@")
 
 version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -n 1)
 # Every 0.x may break its callers, so the name has the minor version; from 1 on the major one.
@@ -34,16 +34,16 @@ esac
 
 mkdir -p "$out/include" "$out/lib/pkgconfig" "$out/lib/cmake/nightsplat"
 cargo rustc "${options[@]}" --crate-type cdylib -- -C "link-arg=-Wl,-soname,libnightsplat.so.$abi"
-install -m 755 "$built/libnightsplat.so" "$out/lib/libnightsplat.so.$abi"
+install -m 755 "$built/libnightsplat_capi.so" "$out/lib/libnightsplat.so.$abi"
 [ "$profile" != release ] || strip --strip-unneeded "$out/lib/libnightsplat.so.$abi"
 ln -sf "libnightsplat.so.$abi" "$out/lib/libnightsplat.so"
 if [ "$profile" = release ]; then
     cargo rustc "${options[@]}" --crate-type staticlib
-    install -m 644 "$built/libnightsplat.a" "$out/lib/libnightsplat.a"
+    install -m 644 "$built/libnightsplat_capi.a" "$out/lib/libnightsplat.a"
 fi
-install -m 644 src/capi/nightsplat.h "$out/include/nightsplat.h"
+install -m 644 crates/capi/src/nightsplat.h "$out/include/nightsplat.h"
 fill() { sed -e "s|@VERSION@|$version|; s|@PREFIX@|$out|; s|@ABI@|$abi|" "$1" > "$2"; }
-fill src/capi/nightsplat.pc.in "$out/lib/pkgconfig/nightsplat.pc"
-fill src/capi/nightsplat-config.cmake.in "$out/lib/cmake/nightsplat/nightsplat-config.cmake"
+fill crates/capi/src/nightsplat.pc.in "$out/lib/pkgconfig/nightsplat.pc"
+fill crates/capi/src/nightsplat-config.cmake.in "$out/lib/cmake/nightsplat/nightsplat-config.cmake"
 flags="PKG_CONFIG_PATH=$out/lib/pkgconfig pkg-config --cflags --libs nightsplat vulkan"
 echo "wrote $out; build a host with: cc host.c \$($flags)"

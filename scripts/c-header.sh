@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Writes src/capi/nightsplat.h from the Rust of src/capi with cbindgen; with --verify, fails where the file differs.
+# Writes crates/capi/src/nightsplat.h from the Rust beside it with cbindgen; with --verify, fails where it differs.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
 version=0.29.4
-header=src/capi/nightsplat.h
+header=crates/capi/src/nightsplat.h
 cbindgen=$(command -v cbindgen || true)
 if [ -z "$cbindgen" ] || [ "$("$cbindgen" --version)" != "cbindgen $version" ]; then
     root=target/tools
@@ -17,9 +17,12 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 # One file in the order of the header. What Rust callers must promise, C programmers read from the types.
 for part in error device camera model render train; do
-    awk '/^\/\/!/ { next } /^ *\/\/\/ # Safety/ { skips = 1 } !/^ *\/\/\// { skips = 0 } !skips' "src/capi/$part.rs"
+    awk '/^\/\/!/ || /^#\[(cfg|path)/ || /^mod / { next }
+        /^ *\/\/\/ # Safety/ { skips = 1 }
+        !/^ *\/\/\// { skips = 0 }
+        !skips' "crates/capi/src/$part.rs"
 done | awk '/^\/\/\/$/ { held = $0; next } held { if (/^\/\/\//) print held; held = "" } { print }' > "$folder/capi.rs"
-"$cbindgen" --quiet --config src/capi/cbindgen.toml --output "$folder/nightsplat.h" "$folder/capi.rs"
+"$cbindgen" --quiet --config crates/capi/src/cbindgen.toml --output "$folder/nightsplat.h" "$folder/capi.rs"
 
 if [ "${1:-}" = --verify ]; then
     diff -u "$header" "$folder/nightsplat.h" || {

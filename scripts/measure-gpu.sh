@@ -80,7 +80,7 @@ pack() {
 
     local program growth tests
     program=$(cargo build --profile "$profile" --bin nightsplat "$messages" | executables '"kind":\["bin"\]')
-    tests=$(cargo test --no-run --profile "$profile" "${targets[@]}" "$messages" |
+    tests=$(cargo test --no-run --profile "${profile/release/checked}" "${targets[@]}" "$messages" |
         executables '"profile":{[^}]*"test":true}')
     growth=$(cargo build --profile "$profile" --example growth "$messages" | executables '"kind":\["example"\]')
     strip -o "$stage/nightsplat" "$program"

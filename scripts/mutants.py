@@ -35,7 +35,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 WORK = ROOT / "target" / "mutants"
 TREE = WORK / "tree"
-MODULES = ["splats/optimizer", "splats/densify", "loss", "splats/render", "photographs/tone"]
+MODULES = [
+    "src/splats/optimizer", "src/splats/densify", "src/loss", "src/splats/render", "crates/photographs/src/tone"
+]
 TESTS = "cli gpu loss networks photographs splats train"
 # Tests of a mutant run in order of speed until they have taken this many seconds.
 MOST_SECONDS = 120
@@ -69,12 +71,12 @@ pub fn mutant(site: usize) -> u32 {
 
 def listed(modules):
     """The mutants of some modules, numbered from 1."""
-    git = subprocess.run(["git", "ls-files", "src"], cwd=ROOT, check=True, capture_output=True, text=True)
+    git = subprocess.run(["git", "ls-files", "src", "crates"], cwd=ROOT, check=True, capture_output=True, text=True)
     files = git.stdout.split()
-    own = [file for file in files if re.match(rf"src/({'|'.join(modules)})(\.rs$|/.*\.rs$)", file)]
+    own = [file for file in files if re.match(rf"({'|'.join(modules)})(\.rs$|/.*\.rs$)", file)]
     files = [argument for file in own for argument in ("-f", file)]
     try:
-        listing = ["cargo-mutants", "mutants", "--list", "--json", *files]
+        listing = ["cargo-mutants", "mutants", "--workspace", "--list", "--json", *files]
         run = subprocess.run(listing, cwd=ROOT, capture_output=True, text=True)
     except FileNotFoundError:
         sys.exit("cargo-mutants is not installed: `cargo install cargo-mutants --locked`")
@@ -108,7 +110,7 @@ def planted(source, mutants, site):
     for (start, end), own in sorted(functions.items()):
         function = source[start:end]
         body = start + body_at(function)
-        text += source[last:body] + f"{{\nmatch crate::mutant::mutant({site}) {{\n"
+        text += source[last:body] + f"{{\nmatch nightsplat_core::mutant::mutant({site}) {{\n"
         for mutant in own:
             begin, stop = (offset(lines, mutant["span"][end]) for end in ("start", "end"))
             arm = source[body:begin] + " " + mutant["replacement"] + " " + source[stop:end]
@@ -149,10 +151,12 @@ def plant(mutants):
     for file, own in by_file.items():
         text, site = planted((ROOT / file).read_text(), own, site)
         (TREE / file).write_text(text)
-    (TREE / "src/mutant.rs").write_text(CHOICE.replace("SITES", str(site)))
-    library = (ROOT / "src/lib.rs").read_text()
+    (TREE / "crates/core/src/mutant.rs").write_text(CHOICE.replace("SITES", str(site)))
+    # Below all crates with mutants.
+    library = (ROOT / "crates/core/src/lib.rs").read_text()
     first = re.search(r"^(?!//|#!|\s*$)", library, re.M).start()
-    (TREE / "src/lib.rs").write_text(library[:first] + "#[doc(hidden)]\npub mod mutant;\n" + library[first:])
+    module = "#[doc(hidden)]\npub mod mutant;\n"
+    (TREE / "crates/core/src/lib.rs").write_text(library[:first] + module + library[first:])
 
 
 def messages(*arguments):
@@ -256,7 +260,7 @@ def verdict(mutant, tests, programs):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("modules", nargs="*", default=MODULES, metavar="MODULE",
-                        help=f"of src/ [default: {', '.join(MODULES)}]")
+                        help=f"their paths [default: {', '.join(MODULES)}]")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after this time")
     parser.add_argument("--jobs", type=int, default=2, help="tests that run in parallel")
     parser.add_argument("--seed", type=int, default=1, help="of the order of the mutants")
@@ -296,7 +300,7 @@ def main():
     counts = defaultdict(Counter)
     numbers = {mutant["number"] for mutant in mutants}
     for mutant in everything:
-        module = re.match(rf"src/({'|'.join(options.modules)})", mutant["file"])[1]
+        module = re.match(rf"({'|'.join(options.modules)})", mutant["file"])[1]
         what = verdicts.get(mutant["name"], ("not run",))[0] if mutant["number"] in numbers else \
             "unplanted" if mutant in unplanted else "unviable"
         counts[module][what] += 1

@@ -5,8 +5,8 @@
     scripts/public-api.py --write    rewrites that file
     scripts/public-api.py --embedded checks and counts the part that a host without files sees
 
-Reads rustdoc's JSON of a build without the feature `testing`. Fields, variants and trait implementations belong to
-their type and do not count as items.
+Reads rustdoc's JSON of the crate and of those that it exports names of. Fields, variants and trait implementations
+belong to their type and do not count as items.
 """
 
 import difflib
@@ -22,10 +22,16 @@ SNAPSHOT = ROOT / "docs/public-api.txt"
 FORMAT = 57
 
 
-def documented(features: str) -> dict:
-    """Rustdoc's JSON of the library."""
-    command = ["cargo", "rustdoc", "--quiet", "--lib", "--no-default-features", "--features", features]
-    options = ["-Z", "unstable-options", "--output-format", "json", "--cap-lints", "allow"]
+# The package, and the crates that it exports names of.
+PACKAGES = ["nightsplat", "nightsplat-core", "nightsplat-photographs", "nightsplat-synth"]
+
+
+def documented(package: str, features: str) -> dict:
+    """Rustdoc's JSON of a library."""
+    command = ["cargo", "rustdoc", "--quiet", "--package", package, "--lib", "--no-default-features"]
+    command += ["--features", features] if package == "nightsplat" else []
+    # The modules that names are exported of are hidden.
+    options = ["-Z", "unstable-options", "--output-format", "json", "--document-hidden-items", "--cap-lints", "allow"]
     metadata = subprocess.run(
         ["cargo", "metadata", "--no-deps", "--format-version", "1"], cwd=ROOT, check=True, capture_output=True
     )
@@ -38,7 +44,7 @@ def documented(features: str) -> dict:
     rustdoc.chmod(0o755)
     environment = os.environ | {"RUSTDOC": str(rustdoc)}
     subprocess.run([*command, "--", *options], cwd=ROOT, env=environment, check=True)
-    crate = json.loads((target / "doc/nightsplat.json").read_text())
+    crate = json.loads((target / f"doc/{package.replace('-', '_')}.json").read_text())
     if crate["format_version"] != FORMAT:
         sys.exit(f"rustdoc writes JSON of version {crate['format_version']}; {__file__} reads {FORMAT}: adapt it")
     return crate
@@ -82,6 +88,7 @@ def bound(one: dict) -> str:
     return maybe + named(inner["trait"])
 
 
+# The ids of the types that a signature names, in the crate that is being read.
 NAMED: set[int] = set()
 
 
@@ -149,20 +156,53 @@ def signature(sig: dict) -> str:
 # Items
 
 
-class Api:
-    """The lines of a crate, and its numbers of items and parts."""
+def is_hidden(item: dict) -> bool:
+    """Whether an item is no API: `#[doc(hidden)]`."""
+    return any("hidden" in str(attribute) for attribute in item["attrs"])
 
-    def __init__(self, crate: dict):
-        self.index = crate["index"]
+
+class Api:
+    """The lines of the API, and its numbers of items and parts."""
+
+    def __init__(self, crates: dict[str, dict]):
+        self.crates = crates
         self.lines: list[str] = []
         self.items = 0
         self.parts = 0
-        self.seen: set[int] = set()
-        NAMED.clear()
-        self.module(self.index[str(crate["root"])], "nightsplat")
-        own = {number for number in NAMED if str(number) in self.index and self.index[str(number)]["crate_id"] == 0}
-        self.hidden = sorted(self.index[str(number)]["name"] for number in own - self.seen)
+        self.seen: set[tuple] = set()
+        self.traits: list[tuple] = []
+        named: set[tuple] = set()
+        self.named = named
+        self.enter("nightsplat", lambda: self.module(self.index[str(self.crate["root"])], "nightsplat"))
+        self.hidden = sorted(path[-1] for path in named - self.seen if path[0] in crates)
+        self.add_traits()
         self.lines.sort(key=lambda line: line.split(" ", 1)[1])
+
+    def enter(self, name: str, read) -> None:
+        """Reads items of a crate, whose ids are its own."""
+        before, self.crate = getattr(self, "crate", None), self.crates[name]
+        self.index = self.crate["index"]
+        outer = NAMED.copy()
+        NAMED.clear()
+        read()
+        self.named |= {self.path(number) for number in NAMED} - {None}
+        NAMED.clear()
+        NAMED.update(outer)
+        if before:
+            self.crate, self.index = before, before["index"]
+
+    def path(self, number: int) -> tuple | None:
+        """Where an item is defined."""
+        summary = self.crate["paths"].get(str(number))
+        return tuple(summary["path"]) if summary else None
+
+    def defined(self, path: tuple | None) -> tuple[str, dict] | None:
+        """The crate and the item of a path."""
+        crate = self.crates.get(path[0]) if path else None
+        for number, summary in crate["paths"].items() if crate else ():
+            if summary["crate_id"] == 0 and tuple(summary["path"]) == path and number in crate["index"]:
+                return path[0], crate["index"][number]
+        return None
 
     def add(self, kind: str, path: str, rest: str = "") -> None:
         self.items += kind not in ("field", "variant", "impl")
@@ -172,6 +212,8 @@ class Api:
     def module(self, module: dict, path: str) -> None:
         for number in module["inner"]["module"]["items"]:
             item = self.index[str(number)]
+            if is_hidden(item):
+                continue
             (kind, inner), = item["inner"].items()
             if kind != "use":
                 self.item(item, f"{path}::{item['name']}")
@@ -181,14 +223,18 @@ class Api:
                     self.module(target, path)
                 else:
                     self.item(target, f"{path}::{inner['name']}")
+            elif found := self.defined(self.path(inner["id"])):
+                name = f"{path}::{inner['name']}"
+                self.enter(found[0], lambda item=found[1], name=name: self.item(item, name))
             else:
                 self.add("use", f"{path}::{inner['name']}", f" = {inner['source']}")
 
     def item(self, item: dict, path: str) -> None:
         (kind, inner), = item["inner"].items()
-        if item["id"] in self.seen:
+        defined = self.path(item["id"]) or (path,)
+        if defined in self.seen:
             return self.add("use", path)
-        self.seen.add(item["id"])
+        self.seen.add(defined)
         match kind:
             case "module":
                 self.add("mod", path)
@@ -223,6 +269,8 @@ class Api:
             for number in fields:
                 if number is not None and str(number) in self.index:
                     field = self.index[str(number)]
+                    if is_hidden(field):
+                        continue
                     self.add("field", f"{path}::{field['name']}", f": {typed(field['inner']['struct_field'])}")
 
     def held(self, kind: dict | str) -> str:
@@ -239,18 +287,35 @@ class Api:
 
     def implementations(self, numbers: list[int], path: str) -> None:
         traits = []
+        outer = NAMED.copy()
         for number in numbers:
             block = self.index[str(number)]["inner"]["impl"]
             if block["trait"] is None:
                 for one in block["items"]:
                     self.associated(self.index[str(one)], path)
             elif not block["is_synthetic"] and block["blanket_impl"] is None and not block["is_negative"]:
-                if block["trait"]["path"] != "StructuralPartialEq":
-                    traits.append(named(block["trait"]))
-        if traits:
-            self.add("impl", path, f": {', '.join(sorted(set(traits)))}")
+                NAMED.clear()
+                text = named(block["trait"])
+                traits.append((text, {self.path(number) for number in NAMED} - {None}))
+        NAMED.clear()
+        NAMED.update(outer)
+        self.traits.append((path, traits))
+
+    def add_traits(self) -> None:
+        """The traits of each type, but for those of the compiler and those that name what is no API."""
+        for path, traits in self.traits:
+            shown = {
+                text
+                for text, types in traits
+                if text not in ("StructuralPartialEq", "TrivialClone")
+                and all(one in self.seen for one in types if one[0] in self.crates)
+            }
+            if shown:
+                self.add("impl", path, f": {', '.join(sorted(shown))}")
 
     def associated(self, item: dict, path: str) -> None:
+        if is_hidden(item):
+            return
         (kind, inner), = item["inner"].items()
         path = f"{path}::{item['name']}"
         match kind:
@@ -264,7 +329,9 @@ class Api:
 
 def main() -> None:
     is_embedded = sys.argv[1:] == ["--embedded"]
-    api = Api(documented("glslang" if is_embedded else "glslang,io"))
+    features = "glslang" if is_embedded else "glslang,train"
+    packages = PACKAGES[:2] if is_embedded else PACKAGES
+    api = Api({package.replace("-", "_"): documented(package, features) for package in packages})
     print(f"{api.items} public items, {api.parts} fields and variants")
     if api.hidden:
         sys.exit(f"the API uses types that are not part of it: {', '.join(api.hidden)}")

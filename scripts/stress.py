@@ -59,7 +59,7 @@ def synth(folder, side, views):
 
 def table(_):
     """Hostile inputs, each against the references."""
-    run("cargo", "test", "--release", "--test", "cli", "--", "--ignored", "--nocapture", "whole_table")
+    run("cargo", "test", "--profile", "checked", "--test", "cli", "--", "--ignored", "--nocapture", "whole_table")
 
 
 def night(_):
@@ -69,13 +69,14 @@ def night(_):
 
 def conditioning(_):
     """Adam over 100 000 steps."""
-    run("cargo", "test", "--release", "--test", "splats", "conditioning::", "--", "--include-ignored", "--nocapture")
+    options = ["--include-ignored", "--nocapture"]
+    run("cargo", "test", "--profile", "checked", "--test", "splats", "conditioning::", "--", *options)
 
 
 def cameras(_):
     """COLMAP on real dark photographs, and training with its poses."""
     test = ["--test", "photographs", "--", "--ignored", "--nocapture", "real_dark_photographs"]
-    run("cargo", "test", "--release", *test)
+    run("cargo", "test", "--profile", "checked", *test)
 
 
 def resident(pid):
@@ -293,7 +294,7 @@ def growth(_):
     if not os.environ.get("NIGHTSPLAT_SCENES"):
         subprocess.run([ROOT / "scripts/not-run.sh", "scenes", "NIGHTSPLAT_SCENES names none"], check=True)
         return
-    run("cargo", "test", "--release", "--lib", "--", "--ignored", "--nocapture", "no_round_of_a_real_scene")
+    run("cargo", "test", "--profile", "checked", "--lib", "--", "--ignored", "--nocapture", "no_round_of_a_real_scene")
 
 
 ALL = (table, night, conditioning, cameras, long, kills, terminals, bombs, links, fuzz, guards, growth)

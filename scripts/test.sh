@@ -29,8 +29,8 @@ if [ $# -gt 0 ]; then
     timed "$@" || status=$?
 else
     # What cargo runs by default; examples of the documentation have no runner.
-    timed --lib --bins --tests --examples || status=$?
-    cargo test --doc --no-fail-fast || { status=$? && echo "documentation" >> "$NIGHTSPLAT_TIMES/failed"; }
+    timed --workspace --lib --bins --tests --examples || status=$?
+    cargo test --workspace --doc --no-fail-fast || { status=$? && echo "documentation" >> "$NIGHTSPLAT_TIMES/failed"; }
 fi
 echo "test programs, slowest first:"
 sort -rn "$NIGHTSPLAT_TIMES/programs"

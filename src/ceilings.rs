@@ -4,7 +4,6 @@
 use std::time::{Duration, Instant};
 
 use crate::Result;
-#[cfg(feature = "check")]
 use crate::gpu::CheckReport;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::ceiling;
@@ -84,7 +83,6 @@ impl Ceiling {
     }
 
     /// Checks each operation on a few vectors.
-    #[cfg(feature = "check")]
     pub(crate) fn check(gpu: &Gpu) -> Result<CheckReport> {
         const VECTORS: usize = 1000;
         let mut ceiling = Self::new(gpu, [VECTORS; 2], 2)?;

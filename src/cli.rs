@@ -7,12 +7,12 @@ use std::path::Path;
 use anyhow::Result;
 use clap::{FromArgMatches, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
+pub use nightsplat_core::output::one_line;
+use nightsplat_core::settings::Setting;
+use nightsplat_photographs::image::{Image, ImageFile};
 use tracing::field::Field;
 use tracing_subscriber::fmt::format::Writer;
 
-pub use crate::base::output::one_line;
-use crate::base::settings::Setting;
-use crate::photographs::image::Image;
 use crate::train::settings::setting;
 
 pub mod bench;

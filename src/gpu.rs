@@ -10,9 +10,7 @@
 mod address_space;
 mod allocated;
 mod buffer;
-#[cfg(feature = "check")]
 mod check;
-#[cfg(feature = "check")]
 mod checked;
 mod choice;
 mod cooperative;
@@ -20,7 +18,7 @@ mod descriptors;
 mod device;
 mod device_report;
 mod download;
-#[cfg(feature = "testing")]
+#[cfg(debug_assertions)]
 mod faults;
 mod host;
 mod image;
@@ -42,7 +40,7 @@ mod statistics;
 mod subgroups;
 mod submission;
 mod supported;
-#[cfg(feature = "testing")]
+#[cfg(debug_assertions)]
 #[doc(hidden)]
 pub mod testing;
 mod tuning;
@@ -56,22 +54,19 @@ use std::thread::{self, ThreadId};
 
 use ash::{ext, khr, vk};
 
-#[cfg(feature = "capi")]
-pub(crate) use allocated::HostMemoryError;
+pub use allocated::HostMemoryError;
 pub use buffer::Buffer;
-#[cfg(feature = "check")]
 pub use check::{CheckReport, CheckedPass, Difference, Tolerance};
 pub use choice::DeviceChoice;
 pub(crate) use choice::SchedulerVariables;
 pub use cooperative::CooperativeMatrix;
 pub(crate) use device::cache_folder;
-#[cfg(feature = "capi")]
-pub(crate) use device::check_physical_device;
+pub use device::check_physical_device;
 pub use device_report::{DeviceLimits, DeviceReport, RequirementReport, devices};
 pub use download::Download;
 pub use image::{HostImage, ImageFormat, ImageState};
 pub use kernel::{Binding, Bound, Interface, Kernel, Recordable};
-#[cfg(feature = "check")]
+#[cfg(feature = "train")]
 pub use kernel::{OnHost, Reference};
 pub use lent::{HostAllocation, HostDevice, HostFrame, MemoryFunctions, QueueLock};
 pub(crate) use limits::WORKGROUP;
@@ -163,12 +158,11 @@ struct GpuShared {
     usage: memory::MemoryUsage,
     /// Memory that other processes take of the device; absent where the driver does not report it.
     budget: Option<memory::BudgetQuery>,
-    #[cfg(feature = "testing")]
+    #[cfg(debug_assertions)]
     faults: faults::Faults,
     retired: Mutex<Vec<(LastUse, Retired)>>,
     recorded: Recorded,
     /// The threads whose submissions are checked.
-    #[cfg(feature = "check")]
     checks: checked::Checks,
     pipeline_cache: vk::PipelineCache,
     /// The file of the fastest tiles, read on first use.
@@ -237,6 +231,10 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+fn vulkan_error(call: &'static str, device: String, result: vk::Result) -> Error {
+    Error::Vulkan { call, device, result: result.to_string(), code: result.as_raw() }
+}
+
 impl Gpu {
     /// The device's identity and limits.
     pub fn properties(&self) -> &Properties {
@@ -253,7 +251,7 @@ impl GpuShared {
                 let submission = self.unfinished().unwrap_or_else(|| call.to_owned());
                 Error::DeviceLost { device, submission }
             }
-            _ => Error::Vulkan { call, device, result },
+            _ => vulkan_error(call, device, result),
         }
     }
 
@@ -294,7 +292,7 @@ impl GpuShared {
         // SAFETY: the semaphore lives as long as `self`.
         unsafe { self.device.wait_semaphores(&wait, u64::MAX) }
             .map_err(|result| self.error("vkWaitSemaphores", result))?;
-        #[cfg(feature = "testing")]
+        #[cfg(debug_assertions)]
         if self.faults.is_lost() {
             return Err(self.error("vkWaitSemaphores", vk::Result::ERROR_DEVICE_LOST));
         }

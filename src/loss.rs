@@ -15,13 +15,13 @@ mod structure;
 use std::sync::Arc;
 
 use glam::UVec2;
+use nightsplat_core::random::Stream;
+use nightsplat_core::settings;
+use nightsplat_core::settings::Rule;
 
-use crate::base::random::Stream;
-use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::splats::scene::{Feature, Features};
 use crate::{Error, Result};
-
 pub use denoising::DenoisingLoss;
 pub use depth::{DepthBoxes, DepthLoss};
 pub use image::{Loss, LossInputs};
@@ -129,8 +129,8 @@ impl Term {
     }
 
     /// Its index among the columns.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn index(self) -> usize {
+    #[doc(hidden)]
+    pub fn index(self) -> usize {
         Self::all().position(|term| term == self).unwrap_or_default()
     }
 }

@@ -98,7 +98,7 @@ impl Gpu {
     /// [`Error::SelfTest`], which names the first check that fails; the device only records, refuses the kernel, or was
     /// lost.
     pub fn self_test(&self) -> Result<()> {
-        #[cfg(feature = "testing")]
+        #[cfg(debug_assertions)]
         let _paused = crate::gpu::testing::pause_faults(self);
         let found = self.run_self_test()?;
         self.free_unused();
@@ -110,7 +110,6 @@ impl Gpu {
     }
 
     /// Compiles every kernel with its default constants, and calls `begins` with its name before.
-    #[cfg(feature = "cli")]
     pub(crate) fn compile_all(&self, mut begins: impl FnMut(&str)) -> Result<()> {
         // Those with matrices have other constants on each device.
         let matrices = |name: &str| name.ends_with("_half");
@@ -123,9 +122,9 @@ impl Gpu {
     }
 
     fn run_self_test(&self) -> Result<SelfTestResult> {
-        #[cfg(feature = "testing")]
+        #[cfg(debug_assertions)]
         let planted = crate::gpu::testing::faults(self).planted_check().unwrap_or(CHECKS);
-        #[cfg(not(feature = "testing"))]
+        #[cfg(not(debug_assertions))]
         let planted = CHECKS;
         let pipeline = self.pipeline::<Kernel>(&Constants::default())?;
         let numbers = self.buffer("numbers", &NUMBERS)?;

@@ -20,20 +20,21 @@
 
 pub mod attributes;
 pub mod batches;
-#[cfg(feature = "io")]
+pub(crate) mod camera;
+#[cfg(feature = "train")]
 pub mod densify;
 pub mod harmonics;
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 pub mod joined;
 pub mod lamp;
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 pub mod levels;
 pub mod model;
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 pub mod optimizer;
 pub mod packed_sh;
 pub mod render;
 pub mod scene;
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 pub mod smoothing;
 pub mod sort;

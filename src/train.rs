@@ -28,7 +28,6 @@ mod paths;
 mod planned;
 mod precision;
 mod preset;
-#[cfg(feature = "testing")]
 mod reference;
 mod rendered;
 pub mod settings;
@@ -39,19 +38,18 @@ mod target_views;
 mod terms;
 mod views;
 
-use crate::camera::{Camera, TrainingFrame};
-#[cfg(feature = "check")]
+use nightsplat_core::camera::{Camera, TrainingFrame};
+use nightsplat_photographs::dataset::{Dataset, Fingerprint};
+use nightsplat_photographs::tone::SceneLaw;
+
 use crate::gpu::CheckReport;
 use crate::gpu::{Gpu, PassTime, Recorder};
 use crate::loss::Term;
-use crate::photographs::dataset::{Dataset, Fingerprint};
-use crate::photographs::tone::SceneLaw;
 use crate::splats::optimizer::{Adam, AdamStep, FiniteCheck, GaussianStep, LearningRates};
 use crate::splats::render::{Damping, Gradients, RenderOptions, Renderer};
 use crate::splats::scene::{ATTRIBUTES, Gaussians, ModelFacts};
 use crate::splats::smoothing::SmoothingFloor;
 use crate::{Error, Result, splats};
-
 pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
 pub use config::{
@@ -73,7 +71,6 @@ use passes::background;
 pub use planned::{PlanSource, PlannedRun, RequestedSettings, diagnosed};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
-#[cfg(feature = "testing")]
 pub use reference::reference;
 pub use rendered::Rendered;
 use submission::Submissions;
@@ -231,8 +228,8 @@ impl Trainer {
     }
 
     /// The Gaussians in [`Trainer::frame`], bit for bit as trained.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn gaussians_in_frame(&self) -> Result<Gaussians> {
+    #[doc(hidden)]
+    pub fn gaussians_in_frame(&self) -> Result<Gaussians> {
         self.model.download(&self.gpu)
     }
 
@@ -242,13 +239,13 @@ impl Trainer {
     }
 
     /// The frame in which the Gaussians are trained.
-    #[cfg(feature = "testing")]
+    #[doc(hidden)]
     pub fn frame(&self) -> &TrainingFrame {
         &self.frame
     }
 
     /// Reserves memory for this number of intersections of a view.
-    #[cfg(feature = "testing")]
+    #[doc(hidden)]
     pub fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
         self.renderer.set_intersection_capacity(intersections)
     }
@@ -279,7 +276,6 @@ impl Trainer {
     }
 
     /// Trains one step with every pass checked; a difference is an error or a warning, as configured.
-    #[cfg(feature = "check")]
     fn agreeing_step(&mut self) -> Result<Vec<StepReport>> {
         let (reports, checks) = self.check_step();
         match checks.agree() {
@@ -290,15 +286,8 @@ impl Trainer {
         reports
     }
 
-    #[cfg(not(feature = "check"))]
-    fn agreeing_step(&mut self) -> Result<Vec<StepReport>> {
-        let problem = "`check.every` needs the CPU references, which this build lacks";
-        Err(Error::Usage(format!("{problem}: build with feature `check`, or set it to 0")))
-    }
-
     /// Trains one step with every pass checked ([`Gpu::checked`]), density control included. The model has the same
     /// bits as after [`Trainer::advance`]; a step that must be redone with more memory is not reported.
-    #[cfg(feature = "check")]
     pub fn check_step(&mut self) -> (Result<Vec<StepReport>>, CheckReport) {
         let next = self.step + 1;
         self.gpu.clone().checked(|| self.submit_steps(next))
@@ -378,14 +367,14 @@ impl Trainer {
     }
 
     /// The networks, if the model has any.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn networks(&mut self) -> Option<&mut Networks> {
+    #[doc(hidden)]
+    pub fn networks(&mut self) -> Option<&mut Networks> {
         self.supervision.networks()
     }
 
     /// The learning rates of a step, including the cooldown.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn learning_rates(&self, step: u64) -> LearningRates {
+    #[doc(hidden)]
+    pub fn learning_rates(&self, step: u64) -> LearningRates {
         let rates = self.config.schedule.learning_rates(step, self.extent);
         let mut rates = rates.scaled(self.cooldown_factor(step));
         for spec in &ATTRIBUTES {
@@ -406,8 +395,8 @@ impl Trainer {
     }
 
     /// [`Trainer::render`] in even light, as [`Trainer::model`] is, if the model has a lamp.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn render_in_even_light(&mut self, camera: &Camera) -> Result<Rendered> {
+    #[doc(hidden)]
+    pub fn render_in_even_light(&mut self, camera: &Camera) -> Result<Rendered> {
         self.renderer.set_even_light(true);
         let rendered = self.render(camera);
         self.renderer.set_even_light(false);

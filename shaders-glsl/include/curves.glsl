@@ -1,5 +1,5 @@
 // The shapes of the tone curves, f(t) for t >= 0: a number, a function and a case each.
-// `src/photographs/tone/families/catalogue.rs` has a row for each on the host, with the same formula.
+// `crates/core/src/curves/catalogue.rs` has a row for each on the host, with the same formula.
 
 const uint CURVE_NONE                = 0;
 const uint CURVE_LINEAR              = 1;

@@ -1,6 +1,7 @@
 //! The memory and disk of a block's training, foreseen from its numbers.
 
-use crate::photographs::dataset::Dataset;
+use nightsplat_photographs::dataset::Dataset;
+
 use crate::splats::attributes::rest_coefficients;
 use crate::splats::packed_sh::StorageFormat;
 use crate::train::{CacheSize, TrainConfig};

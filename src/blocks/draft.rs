@@ -1,13 +1,14 @@
 //! The numbers of the tasks of a plan, and the views and points of its blocks.
 
+use nightsplat_core::hash;
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::dataset::block::{Block, Cell};
+
 use super::budget::Budget;
 use super::partition::BlockCells;
 use super::plan::{COARSE, PlanFile, PlanRow, Request};
 use super::visibility::Visibility;
-use crate::base::hash;
-use crate::base::random::Stream;
-use crate::photographs::dataset::Dataset;
-use crate::photographs::dataset::block::{Block, Cell};
 use crate::train::TrainConfig;
 
 /// The share of the steps that the coarse model takes.

@@ -2,12 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::camera::TrainingFrame;
+use nightsplat_core::output;
 use serde::Serialize;
 
 use super::plan::{BLOCKS, BlockPlan, COARSE, LAW, PLAN, PlanFile, PlanRow};
 use super::task::{self, TASKS, Task};
-use crate::base::output;
-use crate::camera::TrainingFrame;
 use crate::splats::joined::{MANIFEST, MODEL};
 use crate::splats::optimizer::Schedule;
 use crate::train::{CacheSize, TrainConfig};

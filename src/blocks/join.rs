@@ -5,12 +5,12 @@ use std::collections::BTreeSet;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::{hash, input, output};
+use nightsplat_photographs::dataset::block::{Block, Cell};
 use sha2::{Digest, Sha256};
 
 use super::folder::{model_of, task_folder};
 use super::plan::PlanFile;
-use crate::base::{hash, input, output};
-use crate::photographs::dataset::block::{Block, Cell};
 use crate::results::export::{Format, Provenance};
 use crate::results::models;
 use crate::results::run::{self, RunDirectory, TRAINED_WITH};

@@ -4,8 +4,7 @@
 //! file nor the number of threads changes a bit.
 
 use glam::DVec3;
-
-use crate::photographs::dataset::block::Cell;
+use nightsplat_photographs::dataset::block::Cell;
 
 /// The halo reaches this share of the core's side beyond each face of the core.
 const HALO: f64 = 0.2;
@@ -171,7 +170,7 @@ fn widened(core: &Cell, sides: [f64; 3], reach: f64) -> Cell {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::base::random::Stream;
+    use nightsplat_core::random::Stream;
 
     fn street(count: u64) -> Vec<WeightedPoint> {
         let stream = Stream::new(3, 1);

@@ -2,12 +2,12 @@
 
 use std::path::Path;
 
+use nightsplat_core::input;
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::dataset::block::Block;
+use nightsplat_photographs::scene_tone::SceneTone;
 use serde::{Deserialize, Serialize};
 
-use crate::base::input;
-use crate::photographs::dataset::Dataset;
-use crate::photographs::dataset::block::Block;
-use crate::photographs::targets::SceneTone;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 

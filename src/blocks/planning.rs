@@ -2,14 +2,15 @@
 
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::hash::{self, Hasher};
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::scene_tone::SceneTone;
+
 use super::budget::Budget;
 use super::draft::{Draft, block_id};
 use super::partition::{BlockCells, Until, WeightedPoint, partition};
 use super::plan::{BlockPlan, LAW, PlanFile, Request, VERSION};
 use super::visibility::Visibility;
-use crate::base::hash::{self, Hasher};
-use crate::photographs::dataset::Dataset;
-use crate::photographs::targets::SceneTone;
 use crate::train::{PlannedRun, StopConfig, TrainConfig};
 use crate::{Error, Result};
 

@@ -3,10 +3,11 @@
 use std::collections::BTreeSet;
 use std::time::Instant;
 
+use nightsplat_core::camera::Camera;
+use nightsplat_photographs::dataset::View;
+
 use crate::Result;
-use crate::camera::Camera;
 use crate::gpu::Gpu;
-use crate::photographs::dataset::View;
 use crate::train::{PlannedRun, Trainer};
 
 /// Views that are trained on: more would take more time to load, and none to measure.

@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
+use nightsplat_core::input;
 use serde::{Deserialize, Serialize};
 
-use crate::base::input;
 use crate::{Error, Result};
 
 /// The file of the tasks.

@@ -1,10 +1,10 @@
 //! Which views show a block, by the points that they see.
 
 use glam::DVec3;
+use nightsplat_photographs::dataset::{Dataset, Point, View};
 use rayon::prelude::*;
 
 use super::partition::BlockCells;
-use crate::photographs::dataset::{Dataset, Point, View};
 
 /// A view serves a block that contains this share of its points.
 const SHARE: f64 = 0.05;
@@ -153,9 +153,9 @@ mod tests {
 
     use super::*;
     use crate::blocks::partition::{Until, WeightedPoint, partition};
-    use crate::camera::Camera;
-    use crate::photographs::dataset::Split;
-    use crate::photographs::image::Image;
+    use nightsplat_core::camera::Camera;
+    use nightsplat_photographs::dataset::Split;
+    use nightsplat_photographs::image::Image;
 
     /// `count` views along a street, each of which sees the points within 4 of it.
     fn street(count: u32, has_tracks: bool) -> Dataset {

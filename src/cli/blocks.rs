@@ -6,12 +6,13 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use clap::Subcommand;
+use nightsplat_core::output::printable;
+use nightsplat_photographs::tree::check_writable;
 
 use self::work::work;
 use super::train::TrainOptions;
 use super::{driver, finish, print, table, tell, word};
 use crate::Error;
-use crate::base::output::{check_writable, printable};
 use crate::blocks::{self, BlockPlan, MAX_ROUNDS, PlanRow, Request};
 use crate::gpu::DeviceChoice;
 use crate::train::{CacheSize, PlanSource};

@@ -3,12 +3,12 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
+use nightsplat_photographs::dataset::Dataset;
 use serde_json::{Value, json};
 
 use super::train::TrainOptions;
 use super::{driver, finish, print, table, word};
 use crate::gpu::{CheckReport, CheckedPass, DeviceChoice, Gpu};
-use crate::photographs::dataset::Dataset;
 use crate::train::Trainer;
 
 /// Compare every pass of some training steps with its CPU reference, and name the first number that differs.

@@ -3,11 +3,12 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
+use nightsplat_core::output::{one_line, write_whole};
+use nightsplat_photographs::tree::check_writable;
 
 use super::eval::LpipsRange;
 use super::{driver, finish, print, table, word};
 use crate::Error;
-use crate::base::output::{check_writable, one_line, write_whole};
 use crate::gpu::DeviceChoice;
 use crate::results::comparison::{CompareOptions, RunComparison};
 

@@ -4,12 +4,12 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use nightsplat_synth::{self, SyntheticOptions};
 
 use super::export::{self, ExportArgs};
 use super::sweep::{self, SweepArgs, parsed};
 use crate::Error;
 use crate::gpu::DeviceChoice;
-use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
 
 /// Write a small dark dataset, train on it with several tone curves, and compare the results on a page.
 ///
@@ -42,7 +42,7 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     if !args.out.join("sweep.toml").exists() {
         let [width, height] = SIZE;
         let options = SyntheticOptions { width, height, ..SyntheticOptions::default() };
-        synthetic::write(&set, &options)?;
+        nightsplat_synth::write(&set, &options)?;
     }
     let device = args.device.iter().flat_map(|it| ["--device".to_owned(), it.to_string()]);
     let device: Vec<OsString> = device.map(OsString::from).collect();
@@ -59,7 +59,7 @@ pub fn run(args: &DemoArgs) -> Result<()> {
         "Trained on photographs that were exposed {} times too short, with shot and read noise, at 8 bits. Each \
          tone curve maps the photographs to the targets of training. The reference images in normal light are used \
          for the scores only.",
-        synthetic::DARKENING
+        nightsplat_synth::DARKENING
     );
     let link =
         [format!("{SHOWN}/model.html"), "Fly through the model of the curve auto".to_owned()];

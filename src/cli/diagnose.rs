@@ -4,14 +4,15 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use nightsplat_core::output::{one_line, write_whole};
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::tree::check_writable;
 use serde::Serialize;
 
 use super::settings::{Selection, SettingOptions, push_dataset};
 use super::{driver, finish, print, table, word, words};
 use crate::Error;
-use crate::base::output::{check_writable, one_line, write_whole};
 use crate::gpu::DeviceChoice;
-use crate::photographs::dataset::Dataset;
 use crate::results::diagnosis;
 use crate::results::eval::{ResidualTransmittance, hole_warning};
 use crate::results::finished_run::FinishedRun;

@@ -5,7 +5,8 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
 
-use crate::base::output::write_whole;
+use nightsplat_core::output::write_whole;
+
 use crate::gpu::{DeviceChoice, DeviceReport, Gpu, SchedulerVariables, cache_folder, devices};
 use crate::results::finished_run::Opener;
 use crate::self_test::TEST_VARIABLE;

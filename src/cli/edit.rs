@@ -5,11 +5,12 @@ mod operations;
 use std::path::PathBuf;
 
 use anyhow::Result;
+use nightsplat_core::output::one_line;
+use nightsplat_photographs::tree::check_writable;
 
 use self::operations::Operations;
 use super::{driver, finish, tell, word};
 use crate::Error;
-use crate::base::output::{check_writable, one_line};
 use crate::gpu::DeviceChoice;
 use crate::results::edit::{EditList, Editor};
 

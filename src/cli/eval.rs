@@ -4,13 +4,14 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 use indicatif::ProgressBar;
+use nightsplat_core::output::{one_line, write_whole};
+use nightsplat_photographs::dataset::DOWNSCALE;
+use nightsplat_photographs::tree::check_writable;
 
 use super::{driver, finish, print, progress_bar, table, word};
 use crate::Error;
-use crate::base::output::{check_writable, one_line, write_whole};
 use crate::gpu::DeviceChoice;
 use crate::networks::lpips::Range;
-use crate::photographs::dataset::DOWNSCALE;
 use crate::results::evaluation::{EvalOptions, RunEvaluation};
 use crate::results::finished_run::is_model;
 

@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use nightsplat_core::camera::frame::relative_to;
+use nightsplat_photographs::tree::check_writable;
 
 use super::{driver, finish, word, words};
 use crate::Error;
-use crate::base::output::check_writable;
-use crate::camera::frame::relative_to;
 use crate::gpu::DeviceChoice;
 use crate::results::export::streamed::{self, Division, MAX_LEVELS, Written};
 use crate::results::export::{Format, spz};

@@ -1,10 +1,10 @@
 //! Help: `-h` shows the options that most people use, `--help-all` shows all of them in groups.
 
 use clap::{Arg, ArgAction, Command, CommandFactory};
+use nightsplat_photographs::tone::Tone;
 use toml::Value;
 
 use super::Cli;
-use crate::photographs::tone::Tone;
 use crate::train::{TrainConfig, values};
 
 /// The options of a command that `-h` shows; of a command that is not listed it shows all.

@@ -6,10 +6,10 @@ use std::path::PathBuf;
 
 use clap::Command;
 use clap_mangen::Man;
+use nightsplat_core::output::write_whole;
 
 use super::{finish, help};
 use crate::Error;
-use crate::base::output::write_whole;
 
 /// Write man pages: nightsplat.1 and one per command
 #[derive(Clone, Debug, clap::Args)]

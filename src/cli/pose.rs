@@ -6,13 +6,11 @@ use std::time::Instant;
 
 use anyhow::Result;
 use indicatif::ProgressBar;
+use nightsplat_photographs::image::StoredLight;
 
 use super::{driver, finish, progress_bar, tell_on_stderr, word};
 use crate::gpu::DeviceChoice;
-use crate::photographs::image::StoredLight;
-use crate::photographs::pose::{
-    Mapper, Matcher, PoseOptions, PoseProgress, Posed, describe, estimate,
-};
+use crate::pose::{Mapper, Matcher, PoseOptions, PoseProgress, Posed, describe, estimate};
 
 /// Estimate the cameras of dark photographs with COLMAP, and write a dataset for `train`.
 ///

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::Result;
+use nightsplat_photographs::image::ImageFile as _;
 
 mod shots;
 
@@ -11,18 +12,19 @@ use self::shots::{Shot, shots};
 use super::words::NamedValues;
 use super::{OutputFormat, driver, finish, progress_bar, word};
 use crate::Error;
-use crate::base::output::{check_writable, create_folder, one_line};
-use crate::camera::Easing;
 use crate::gpu::DeviceChoice;
-use crate::photographs::dataset::{Dataset, Split, View};
-use crate::photographs::image::Image;
-use crate::photographs::targets::SceneTone;
 use crate::results::colour_map;
 use crate::results::eval::RenderLayer;
 use crate::results::finished_run::FinishedRun;
 use crate::results::linear_light::{Clipped, STOPS, in_unit, photograph_of};
 use crate::results::video;
 use crate::results::view_exposures::ViewExposures;
+use nightsplat_core::camera::Easing;
+use nightsplat_core::output::{create_folder, one_line};
+use nightsplat_photographs::dataset::{Dataset, Split, View};
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tree::check_writable;
 
 /// Render a run from the cameras of its dataset, or along a path through them.
 ///
@@ -127,7 +129,7 @@ pub enum PathChoice {
     /// The one that stays where the cameras are.
     Auto,
     /// A path by name.
-    Named(crate::camera::CameraPath),
+    Named(nightsplat_core::camera::CameraPath),
     /// A file.
     File(PathBuf),
 }
@@ -136,7 +138,7 @@ impl FromStr for PathChoice {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        use crate::camera::CameraPath;
+        use nightsplat_core::camera::CameraPath;
         Ok(match text {
             "auto" => Self::Auto,
             "orbit" => Self::Named(CameraPath::Orbit),
@@ -300,7 +302,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
         bar.set_message(one_line(name).into_owned());
         let path = file(out, name, *format);
         let mut color = |image: Image| {
-            let image = image.turned(*orientation);
+            let image = orientation.upright(image);
             let image = match &exposures {
                 Some(exposures) => exposures.applied(name, image),
                 None => image,
@@ -326,7 +328,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
             None => color(model_renderer.render_camera(camera)?.output().clone())?,
             Some(layer) if layer.is_color() => color(model_renderer.layer(camera, *layer)?)?,
             Some(layer) => {
-                let numbers = model_renderer.layer(camera, *layer)?.turned(*orientation);
+                let numbers = orientation.upright(model_renderer.layer(camera, *layer)?);
                 save_numbers(args, numbers, *layer, &path)?;
             }
         }

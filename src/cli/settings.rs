@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 
 use clap::builder::ValueParser;
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches, ValueHint};
+use nightsplat_core::settings::{Rule, Setting};
+use nightsplat_photographs::tone::{CurveChoice, GainChoice, Profile, Tone, ToneSettings};
 use toml::{Table, Value};
 
 use super::words::{self, NamedValues};
-use crate::base::settings::{Rule, Setting};
-use crate::photographs::tone::{CurveChoice, GainChoice, Profile, Tone, ToneSettings};
 use crate::train::settings::SETTINGS;
 use crate::train::{Origin, SettingsLayer};
 use crate::{Error, Result};

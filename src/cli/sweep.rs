@@ -27,6 +27,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use clap::Args;
+use nightsplat_core::input;
+use nightsplat_core::output::{create_folder, write_whole};
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::tone::Statistics;
+use nightsplat_photographs::tree::check_writable;
 use serde::Serialize;
 
 use self::grid::Grid;
@@ -40,11 +45,7 @@ use self::runner::FailedPoint;
 use super::eval::LpipsRange;
 use super::{driver, finish, print, progress_bar, tell};
 use crate::Error;
-use crate::base::input;
-use crate::base::output::{check_writable, create_folder, write_whole};
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::photographs::dataset::Dataset;
-use crate::photographs::tone::Statistics;
 use crate::train::{Part, TrainConfig, diagnosed};
 
 /// Train over a grid of settings, and rank the results.

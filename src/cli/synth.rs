@@ -2,11 +2,10 @@
 
 use std::path::PathBuf;
 
+use nightsplat_synth::{self, CameraFaults, Capture, Night, SyntheticOptions};
+
 use super::{finish, word};
 use crate::Error;
-use crate::photographs::dataset::synthetic::{
-    self, CameraFaults, Capture, Night, SyntheticOptions,
-};
 
 /// Write a small dark multi-view dataset of an analytic scene, with references, in the layout of LOM.
 #[derive(Clone, Debug, clap::Args)]
@@ -72,7 +71,7 @@ pub fn run(args: SynthArgs) -> anyhow::Result<()> {
         let problem = "is not empty; choose another folder or pass --overwrite";
         return Err(Error::output(dir, problem).into());
     }
-    synthetic::write_captured(&dir, &options, &capture)?;
+    nightsplat_synth::write_captured(&dir, &options, &capture)?;
     let SyntheticOptions { views, width, height, .. } = options;
     let wrote = format!("{}: {views} views of {width}x{height}", dir.display());
     finish(&wrote, &format!("nightsplat train {} --out run", word(&dir)));

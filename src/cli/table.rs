@@ -1,6 +1,7 @@
 //! Tables for the terminal.
 
-use crate::base::output::one_line;
+use nightsplat_core::output::one_line;
+
 use crate::results::report::{Column, NumberTable};
 
 /// A table of the report as text.

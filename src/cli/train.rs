@@ -6,13 +6,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Result;
+use nightsplat_core::camera::frame;
+use nightsplat_core::output::{one_line, printable};
+use nightsplat_photographs::tree::check_writable;
 
 pub(crate) use self::options::TrainOptions;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
 use super::{driver, finish, live, phases, print, signals, tell, view, word};
-use crate::base::output::{check_writable, one_line, printable};
-use crate::camera::frame;
 use crate::gpu::DeviceChoice;
 use crate::results::eval;
 use crate::results::run::{self, Event, IfExists, RunDirectory, RunSummary, Session};

@@ -3,10 +3,11 @@
 use std::path::PathBuf;
 use std::str::FromStr;
 
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, bright_folder};
+use nightsplat_synth::varied::{self, Variation};
+
 use super::{finish, word};
 use crate::Error;
-use crate::photographs::dataset::varied::{self, Variation};
-use crate::photographs::dataset::{Dataset, LoadOptions, bright_folder};
 
 /// Write a set of varying exposure from one in normal light, with the clean photographs as references.
 ///

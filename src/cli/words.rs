@@ -7,8 +7,8 @@ use std::str::FromStr;
 
 use clap::builder::{PossibleValue, StringValueParser, TypedValueParser};
 use clap::{Arg, Command, Error};
+use nightsplat_photographs::tone::{Tone, ToneCurve};
 
-use crate::photographs::tone::{Tone, ToneCurve};
 use crate::results::export::Format;
 use crate::train::{Part, Preset};
 

@@ -54,7 +54,7 @@ unsafe impl Send for MemorySource {}
 
 /// The host's allocator failed.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum HostMemoryError {
+pub enum HostMemoryError {
     #[error("the host's allocator returned {0:?}")]
     Refused(vk::Result),
     #[error("the host's allocator returned offset {offset}, which is no multiple of {alignment}")]
@@ -63,10 +63,9 @@ pub(crate) enum HostMemoryError {
     Unmapped,
 }
 
-#[cfg(feature = "capi")]
 impl HostMemoryError {
     /// Whether the allocator gave memory that cannot be used, instead of none.
-    pub(crate) fn breaks_the_contract(&self) -> bool {
+    pub fn breaks_the_contract(&self) -> bool {
         !matches!(self, Self::Refused(_))
     }
 }
@@ -257,7 +256,7 @@ fn allocation(
     requirements: vk::MemoryRequirements,
     location: MemoryLocation,
 ) -> Result<Allocation, Box<dyn std::error::Error + Send + Sync>> {
-    #[cfg(feature = "testing")]
+    #[cfg(debug_assertions)]
     if shared.faults.fails_allocation(name) {
         return Err(AllocationError::OutOfMemory.into());
     }

@@ -40,20 +40,20 @@ impl<T: bytemuck::Pod> Buffer<T> {
     }
 
     /// Whether it is in the memory of this device.
-    #[cfg(feature = "capi")]
-    pub(crate) fn is_on(&self, gpu: &Gpu) -> bool {
+    #[doc(hidden)]
+    pub fn is_on(&self, gpu: &Gpu) -> bool {
         self.memory.is_on(&gpu.shared)
     }
 
     /// All of it, to read.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn slice(&self) -> Slice<'_, T> {
+    #[doc(hidden)]
+    pub fn slice(&self) -> Slice<'_, T> {
         Slice::new(&self.memory, self.len)
     }
 
     /// All of it, to read and write.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn slice_mut(&mut self) -> SliceMut<'_, T> {
+    #[doc(hidden)]
+    pub fn slice_mut(&mut self) -> SliceMut<'_, T> {
         SliceMut::new(&self.memory, self.len)
     }
 
@@ -81,7 +81,6 @@ impl<T: bytemuck::Pod> Buffer<T> {
     }
 
     /// Whether passes can bind windows of this number of elements, from multiples of it on.
-    #[cfg(feature = "io")]
     pub(crate) fn suits_windows(&self, window: usize) -> bool {
         self.memory.suit((window * size_of::<T>()) as u64)
     }
@@ -101,8 +100,8 @@ impl<'a, T: bytemuck::Pod> From<&'a mut Buffer<T>> for SliceMut<'a, T> {
 
 impl Gpu {
     /// A buffer of `len` elements whose contents are undefined.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn uninit<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
+    #[doc(hidden)]
+    pub fn uninit<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
         let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
         let Properties { name: device, max_storage_buffer_range: limit, .. } = self.properties();
         if whole_quads(bytes) > *limit {

@@ -14,7 +14,7 @@ use ash::vk;
 use super::check::Versions;
 use super::recorder::{ObservedPass, PassObserver};
 use super::submission::Record;
-#[cfg(feature = "testing")]
+#[cfg(debug_assertions)]
 use super::testing;
 use super::{
     Binding, Bound, CheckReport, CheckedPass, Difference, Download, Gpu, GpuShared, Queue,
@@ -58,6 +58,7 @@ impl Gpu {
     /// that it writes is compared with its reference on the same buffers. The device's results are kept, so the outcome
     /// is that of an unchecked run, bit for bit. Not checked: recordings of a host ([`Gpu::record_into`]) and profiled
     /// ones.
+    #[cfg(feature = "train")]
     pub fn checked<R>(&self, work: impl FnOnce() -> R) -> (R, CheckReport) {
         let scope = CheckedScope { checks: &self.shared.checks, outer: self.shared.checks.take() };
         scope.checks.put(CheckReport::default());
@@ -130,7 +131,7 @@ impl PassObserver for Checked<'_> {
         let ObservedPass { objects, params, bound, threads, reference: reference_of } = *pass;
         let (interface, kernel) = (objects.interface, objects.interface.name);
         let before = copies(recorder, interface.bindings, bound, |_| true)?;
-        #[cfg(feature = "testing")]
+        #[cfg(debug_assertions)]
         let params = &testing::with_defect_of(kernel, params);
         recorder.record_dispatch(objects, params, bound, threads)?;
         let device = copies(recorder, interface.bindings, bound, |binding| binding.writable)?;

@@ -10,13 +10,12 @@ use ash::{ext, khr, vk};
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 
 use super::allocated::MemorySource;
-#[cfg(feature = "check")]
 use super::checked::Checks;
 use super::choice::SelectedDevice;
 use super::cooperative;
 use super::descriptors::Descriptors;
 use super::device_report::{device_memory, driver_name, report};
-#[cfg(feature = "testing")]
+#[cfg(debug_assertions)]
 use super::faults::Faults;
 use super::host::Host;
 use super::instance::{
@@ -28,6 +27,7 @@ use super::memory::{BudgetQuery, MemoryUsage};
 use super::requirements::required_device_features;
 use super::supported::{OPTIONAL_EXTENSIONS, Supported};
 use super::validation::FIRST_SAFE_WITH_LABELS;
+use super::vulkan_error;
 use super::{
     DeviceChoice, DeviceReport, Gpu, GpuShared, HostDevice, Properties, Queue, SchedulerVariables,
     address_space, reconvergence, statistics, tuning,
@@ -131,13 +131,13 @@ impl Gpu {
     }
 
     /// Whether the device only records, so that nothing can be submitted or read back.
-    #[cfg(feature = "capi")]
-    pub(crate) fn is_record_only(&self) -> bool {
+    #[doc(hidden)]
+    pub fn is_record_only(&self) -> bool {
         self.shared.host.as_ref().is_some_and(|host| host.is_record_only)
     }
 
     fn assemble(instance: &ash::Instance, parts: DeviceParts, owner: Owner<'_>) -> Result<Self> {
-        #[cfg(feature = "testing")]
+        #[cfg(debug_assertions)]
         let faults = Faults::from_environment()?;
         let memory = memory_source(instance, &parts, &owner)?;
         let DeviceParts { physical, properties, device, queue, family } = parts;
@@ -173,11 +173,10 @@ impl Gpu {
                 last_submission: AtomicU64::new(0),
                 usage: MemoryUsage::default(),
                 budget: BudgetQuery::new(instance, physical),
-                #[cfg(feature = "testing")]
+                #[cfg(debug_assertions)]
                 faults,
                 retired: Mutex::new(vec![]),
                 recorded: super::Recorded::default(),
-                #[cfg(feature = "check")]
                 checks: Checks::default(),
                 pipeline_cache,
                 owned,
@@ -202,8 +201,7 @@ fn check_family(instance: &ash::Instance, physical: vk::PhysicalDevice, family: 
 ///
 /// # Safety
 /// The handles are valid.
-#[cfg(feature = "capi")]
-pub(crate) unsafe fn check_physical_device(
+pub unsafe fn check_physical_device(
     get_instance_proc_addr: vk::PFN_vkGetInstanceProcAddr,
     instance: vk::Instance,
     physical: vk::PhysicalDevice,
@@ -289,7 +287,7 @@ fn timeline_and_cache(
     owner: &Owner<'_>,
     callbacks: Option<&vk::AllocationCallbacks<'_>>,
 ) -> Result<(vk::Semaphore, vk::PipelineCache)> {
-    let fail = |call| move |result| Error::Vulkan { call, device: name.to_owned(), result };
+    let fail = |call| move |result| vulkan_error(call, name.to_owned(), result);
     let mut kind =
         vk::SemaphoreTypeCreateInfo::default().semaphore_type(vk::SemaphoreType::TIMELINE);
     let semaphore = vk::SemaphoreCreateInfo::default().push_next(&mut kind);
@@ -424,7 +422,7 @@ fn create_device(
     unsafe {
         let device = instance
             .create_device(physical, &info, None)
-            .map_err(|result| Error::Vulkan { call: "vkCreateDevice", device, result })?;
+            .map_err(|result| vulkan_error("vkCreateDevice", device, result))?;
         let queue = device.get_device_queue(family, 0);
         Ok((device, queue, family))
     }

@@ -33,8 +33,8 @@ impl Gpu {
 
 impl Recorder<'_> {
     /// Copies a buffer, or a slice of one, as it is at this point of the recording to the host.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn download<'a, T: bytemuck::Pod>(
+    #[doc(hidden)]
+    pub fn download<'a, T: bytemuck::Pod>(
         &mut self,
         buffer: impl Into<Slice<'a, T>>,
     ) -> Result<Download<T>> {

@@ -4,7 +4,6 @@ use std::fmt::Debug;
 
 use ash::vk;
 
-#[cfg(feature = "check")]
 use super::Tolerance;
 
 /// One storage buffer of a kernel.
@@ -67,7 +66,7 @@ pub trait Kernel: 'static {
 }
 
 /// The buffers of a kernel in host memory. Implemented by `build.rs`.
-#[cfg(feature = "check")]
+#[cfg(feature = "train")]
 pub trait OnHost: Kernel {
     /// The buffers in host memory.
     type Slices<'a>;
@@ -77,23 +76,48 @@ pub trait OnHost: Kernel {
     fn slices(words: &mut [Vec<u32>]) -> Self::Slices<'_>;
 }
 
-/// A kernel whose passes can be recorded: with feature `check`, one that has a reference.
-#[cfg(feature = "check")]
-pub trait Recordable: Reference {}
-#[cfg(feature = "check")]
-impl<K: Reference> Recordable for K {}
+/// A kernel whose passes can be recorded: with feature `train`, one that has a reference.
+pub trait Recordable: Kernel {
+    /// Runs the reference on the words of a pass's buffers; returns the tolerances from other such words.
+    fn reference(
+        params: &Self::Params,
+        constants: &Self::Constants,
+        words: &mut [Vec<u32>],
+        before: &mut [Vec<u32>],
+    ) -> Vec<Tolerance>;
+}
 
-/// A kernel whose passes can be recorded.
-#[cfg(not(feature = "check"))]
-pub trait Recordable: Kernel {}
-#[cfg(not(feature = "check"))]
-impl<K: Kernel> Recordable for K {}
+#[cfg(feature = "train")]
+impl<K: Reference> Recordable for K {
+    fn reference(
+        params: &Self::Params,
+        constants: &Self::Constants,
+        words: &mut [Vec<u32>],
+        before: &mut [Vec<u32>],
+    ) -> Vec<Tolerance> {
+        K::run(params, constants, K::slices(words));
+        K::tolerances(params, constants, K::slices(before)).into()
+    }
+}
+
+/// Nothing is checked: [`Gpu::checked`](super::Gpu) is absent.
+#[cfg(not(feature = "train"))]
+impl<K: Kernel> Recordable for K {
+    fn reference(
+        _: &Self::Params,
+        _: &Self::Constants,
+        _: &mut [Vec<u32>],
+        _: &mut [Vec<u32>],
+    ) -> Vec<Tolerance> {
+        vec![]
+    }
+}
 
 /// The CPU reference of a kernel: same parameters, same buffers, plain loops.
 ///
 /// It reads no more of a slice than parameters and counts specify: a buffer may be longer than a view needs, and its
 /// tail is undefined.
-#[cfg(feature = "check")]
+#[cfg(feature = "train")]
 pub trait Reference: OnHost {
     /// Does to the slices what the kernel does to the buffers.
     fn run(params: &Self::Params, constants: &Self::Constants, slices: Self::Slices<'_>);

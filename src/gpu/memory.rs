@@ -84,8 +84,8 @@ impl Gpu {
     }
 
     /// Restarts the peak from the memory in use now.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn reset_peak_memory(&self) {
+    #[doc(hidden)]
+    pub fn reset_peak_memory(&self) {
         self.free_unused();
         let MemoryUsage { now, peak, .. } = &self.shared.usage;
         peak.store(now.load(Ordering::Acquire), Ordering::Release);

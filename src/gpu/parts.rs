@@ -41,7 +41,6 @@ impl Parts {
         self.parts.first().map_or("", DeviceMemory::name)
     }
 
-    #[cfg(feature = "capi")]
     pub(super) fn is_on(&self, shared: &Arc<GpuShared>) -> bool {
         self.parts.iter().all(|part| Arc::ptr_eq(&part.shared, shared))
     }

@@ -31,8 +31,8 @@ pub(super) struct Objects {
 
 impl Gpu {
     /// Specialises kernel `K` with `constants`.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
+    #[doc(hidden)]
+    pub fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
         let objects = self.objects(K::INTERFACE, K::constants(constants))?;
         let pipeline = Pipeline { constants: *constants, objects };
         if let Some(file) = statistics::file() {
@@ -62,7 +62,7 @@ impl Gpu {
         let fail = |call| move |result| shared.error(call, result);
         let name = described(interface, &constants);
         tracing::debug!("compiles {name}");
-        #[cfg(feature = "testing")]
+        #[cfg(debug_assertions)]
         shared.faults.compile(interface.name).map_err(|result| refused(shared, &name, result))?;
         // SAFETY: every create info points at live locals, and what fails half-way is destroyed here.
         unsafe {

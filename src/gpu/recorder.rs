@@ -8,7 +8,6 @@ use std::sync::atomic::Ordering;
 use ash::vk;
 use ash::vk::Handle as _;
 
-#[cfg(feature = "check")]
 use super::Tolerance;
 use super::descriptors::Sets;
 use super::limits::whole_quads;
@@ -51,7 +50,6 @@ pub struct Recorder<'g> {
     /// The stages outside this recording that read our buffers, before it or after it.
     readers: vk::PipelineStageFlags2,
     /// Runs each pass alone and compares it with its reference instead of recording it.
-    #[cfg(feature = "check")]
     pub(super) observer: Option<&'g mut (dyn PassObserver + 'g)>,
 }
 
@@ -65,7 +63,6 @@ pub(super) enum Timestamps {
 }
 
 /// Runs passes in its own way instead of recording them.
-#[cfg(feature = "check")]
 pub(super) trait PassObserver: std::fmt::Debug {
     /// Does what recording and submitting the pass would do.
     fn pass(&mut self, recorder: &mut Recorder<'_>, pass: &ObservedPass<'_>) -> Result<()>;
@@ -75,7 +72,6 @@ pub(super) trait PassObserver: std::fmt::Debug {
 }
 
 /// A pass without its types.
-#[cfg(feature = "check")]
 pub(super) struct ObservedPass<'a> {
     pub(super) objects: &'a Objects,
     pub(super) params: &'a [u8],
@@ -85,7 +81,6 @@ pub(super) struct ObservedPass<'a> {
 }
 
 /// Runs the reference on the words of a pass's buffers; returns the tolerances from other such words.
-#[cfg(feature = "check")]
 pub(super) type ReferenceOf<'a> = dyn Fn(&mut [Vec<u32>], &mut [Vec<u32>]) -> Vec<Tolerance> + 'a;
 
 /// The timeline value of a recording that the host application submits: none of ours.
@@ -150,7 +145,6 @@ impl<'g> Recorder<'g> {
             labels: vec![],
             pending: HashMap::new(),
             readers,
-            #[cfg(feature = "check")]
             observer: None,
         }
     }
@@ -189,8 +183,8 @@ impl<'g> Recorder<'g> {
     }
 
     /// Records one pass: label, barrier if a hazard requires it, bindings, parameters, dispatch, timestamp.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn dispatch<K: Recordable>(
+    #[doc(hidden)]
+    pub fn dispatch<K: Recordable>(
         &mut self,
         pipeline: &Pipeline<K>,
         params: &K::Params,
@@ -199,11 +193,9 @@ impl<'g> Recorder<'g> {
     ) -> Result<()> {
         let bound = K::bound(&buffers);
         let words = bytemuck::bytes_of(params);
-        #[cfg(feature = "check")]
         if let Some(observer) = self.observer.take() {
-            let reference = |reference: &mut [Vec<u32>], before: &mut [Vec<u32>]| {
-                K::run(params, &pipeline.constants, K::slices(reference));
-                K::tolerances(params, &pipeline.constants, K::slices(before)).into()
+            let reference = |words: &mut [Vec<u32>], before: &mut [Vec<u32>]| {
+                K::reference(params, &pipeline.constants, words, before)
             };
             let objects = &pipeline.objects;
             let pass = ObservedPass {
@@ -245,8 +237,8 @@ impl<'g> Recorder<'g> {
     }
 
     /// Sets every 32-bit word of `buffer` to `word`.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn fill<T: bytemuck::Pod>(&mut self, buffer: &mut Buffer<T>, word: u32) {
+    #[doc(hidden)]
+    pub fn fill<T: bytemuck::Pod>(&mut self, buffer: &mut Buffer<T>, word: u32) {
         buffer.pieces().for_each(|piece| self.fill_raw(piece, word));
     }
 
@@ -280,8 +272,8 @@ impl<'g> Recorder<'g> {
     }
 
     /// Copies elements from the start of `source` to `target`, as many as both hold.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn copy<T: bytemuck::Pod>(&mut self, source: &Buffer<T>, target: &mut Buffer<T>) {
+    #[doc(hidden)]
+    pub fn copy<T: bytemuck::Pod>(&mut self, source: &Buffer<T>, target: &mut Buffer<T>) {
         // Buffers of the same windows have the same pieces.
         for (source, target) in source.pieces().zip(target.pieces()) {
             self.copy_raw(source, target, source.size.min(target.size));

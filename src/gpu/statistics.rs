@@ -52,8 +52,7 @@ pub struct Resources {
 impl Resources {
     /// The names are, in this order: RADV's, NVK's, ANV's, Turnip's, NVIDIA's, AMD's own driver's; without regard to
     /// case. What a driver tells in several numbers is added up.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn from_statistics(statistics: &[Statistic]) -> Self {
+    pub fn from_statistics(statistics: &[Statistic]) -> Self {
         let sum = |names: &[&str]| {
             let is_meant =
                 |told: &&Statistic| names.iter().any(|name| told.name.eq_ignore_ascii_case(name));
@@ -98,8 +97,7 @@ impl Resources {
     }
 
     /// Whether registers did not suffice.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn spill(self) -> bool {
+    pub fn spill(self) -> bool {
         [self.spills, self.scratch].into_iter().flatten().any(|count| count > 0.0)
     }
 }

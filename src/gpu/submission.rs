@@ -33,8 +33,7 @@ pub struct PassTime {
 
 impl Submission {
     /// Blocks until the work is done.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn wait(&self) -> Result<()> {
+    pub fn wait(&self) -> Result<()> {
         self.shared.wait(self.value)
     }
 }
@@ -82,8 +81,8 @@ impl Gpu {
     /// The queue is locked while `record` runs: other threads that submit wait. Calls that submit themselves, such as
     /// [`Gpu::write`], [`Gpu::zeros`] or [`crate::splats::render::Renderer::reserve`], must come before or after the
     /// recording.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn submit(
+    #[doc(hidden)]
+    pub fn submit(
         &self,
         label: &str,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
@@ -110,8 +109,8 @@ impl Gpu {
     }
 
     /// As [`Gpu::run`], and measures the time of each pass.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn profile(
+    #[doc(hidden)]
+    pub fn profile(
         &self,
         label: &str,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
@@ -121,8 +120,8 @@ impl Gpu {
 
     /// As [`Gpu::run`], and measures the milliseconds from the start of the first pass to the end of the last, with
     /// nothing between the passes that a run without measurement lacks.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn profile_whole(
+    #[doc(hidden)]
+    pub fn profile_whole(
         &self,
         label: &str,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
@@ -222,7 +221,6 @@ impl Gpu {
         record: Record<'_>,
     ) -> Result<(u64, Vec<(&'static str, u64)>)> {
         let shared = &self.shared;
-        #[cfg(feature = "check")]
         if timestamps.is_none() && shared.checks.are_on() {
             let last = shared.record_checked(queue, pool, value, label, record)?;
             return Ok((last, vec![]));
@@ -267,7 +265,7 @@ impl GpuShared {
         value: u64,
         label: &str,
     ) -> Result<()> {
-        #[cfg(feature = "testing")]
+        #[cfg(debug_assertions)]
         if self.faults.loses_submission() {
             return Err(self.error("vkQueueSubmit2", vk::Result::ERROR_DEVICE_LOST));
         }

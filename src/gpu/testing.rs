@@ -177,7 +177,6 @@ pub fn with_defect<R>(defect: Defect, work: impl FnOnce() -> R) -> R {
 }
 
 /// The parameters of a pass, altered where the kernel has the defect.
-#[cfg(feature = "check")]
 pub(super) fn with_defect_of(kernel: &str, params: &[u8]) -> Vec<u8> {
     let mut params = params.to_vec();
     if let Some(defect) = DEFECT.get().filter(|defect| defect.kernel == kernel) {

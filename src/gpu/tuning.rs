@@ -4,11 +4,11 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::output::write_whole;
 use serde::{Deserialize, Serialize};
 
 use super::limits::WORKGROUP;
 use super::{Gpu, Properties};
-use crate::base::output::write_whole;
 use crate::{Error, Result};
 
 /// The variable with the path of another file, or `off`: no file.
@@ -92,8 +92,8 @@ impl Properties {
     /// Whether subgroups can share such tiles: each part has 1 to 32 rows of lanes, lanes fill rows of pixels or the
     /// reverse, all lanes fit a workgroup, and the subgroups stay converged while others leave their loops. A software
     /// device runs one after the other.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn suits_tile(&self, tile: impl Into<Tile>) -> bool {
+    #[doc(hidden)]
+    pub fn suits_tile(&self, tile: impl Into<Tile>) -> bool {
         let tile = tile.into();
         let lanes = u64::from(self.subgroup_size);
         tile.part().is_some_and(|[width, height]| {

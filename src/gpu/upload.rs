@@ -37,8 +37,8 @@ impl Gpu {
 
     /// Overwrites the first elements of a buffer, or of a slice of one, with `data`; blocks until that is done. On a
     /// device that a host lends, the next recording begins with it instead.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn write<'a, T: bytemuck::Pod>(
+    #[doc(hidden)]
+    pub fn write<'a, T: bytemuck::Pod>(
         &self,
         buffer: impl Into<SliceMut<'a, T>>,
         data: &[T],

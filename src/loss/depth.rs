@@ -6,12 +6,12 @@
 use std::sync::Arc;
 
 use glam::UVec2;
+use nightsplat_core::random::Stream;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
     LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, check_weight, no_scratch, pixel_count,
 };
-use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{
     DepthGradient, DepthMoments, depth_boxes, depth_correlation, depth_gradient, depth_moments,

@@ -160,9 +160,9 @@ impl LogSlot<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::base::random::Stream;
     use crate::loss::{LossConfig, ParameterWeights, Weights};
     use crate::splats::scene::Features;
+    use nightsplat_core::random::Stream;
 
     #[test]
     fn the_total_sums_distances_and_one_minus_similarities() {

@@ -7,10 +7,12 @@
 //! ratio, so that its gradient does not grow with the ratio. They do not depend on a view: they are recorded after the
 //! backward pass of the render, and add to its gradient.
 
+use nightsplat_core::settings;
+use nightsplat_core::settings::Rule;
+
 use super::log::{LogSlot, PartialSums};
 use super::{LossSpec, Term, TermOn};
 use crate::Result;
-use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::parameter_terms;
 use crate::splats::batches::Batch;

@@ -9,8 +9,8 @@ use super::{
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::structure_l1;
-use crate::photographs::structure::StructureTarget;
 use crate::splats::scene::Feature;
+use crate::targets::structure::StructureTarget;
 
 pub(super) const SPEC: LossSpec = LossSpec {
     terms: &[Term::STRUCTURE],

@@ -7,8 +7,8 @@
 use std::ops::Range;
 
 use glam::UVec2;
+use nightsplat_core::random::Stream;
 
-use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{crop_gather, crop_scatter};
 use crate::{Error, Result};

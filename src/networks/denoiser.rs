@@ -15,6 +15,9 @@
 mod memory;
 
 use glam::UVec2;
+use nightsplat_core::random::Stream;
+use nightsplat_core::settings;
+use nightsplat_core::settings::Rule;
 
 use self::memory::{Activations, DenoiserMemory, EarlierStages, Repeat};
 use super::conv::{AccumulateInto, Activation, Backward, Conv, Layer, Precision, Strips};
@@ -25,8 +28,6 @@ use super::parameters::{ParameterLayout, Parameters};
 use super::relu::ReluBackward;
 use super::reserved::Reserved;
 use super::{NetworkVariant, RGB};
-use crate::base::random::Stream;
-use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Properties, Recorder, Threads};
 use crate::kernels::{residual, residual_backward};
 use crate::{Error, Result};
@@ -56,8 +57,8 @@ pub struct DenoiserSettings {
 
 impl DenoiserSettings {
     /// The settings of LITA-GS.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn paper() -> Self {
+    #[doc(hidden)]
+    pub fn paper() -> Self {
         Self {
             stages: 3,
             repeats: 6,
@@ -183,13 +184,11 @@ impl Denoiser {
     }
 
     /// The memory of [`Denoiser::reserve`] for a view.
-    #[cfg(feature = "testing")]
     pub fn bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
         memory::bytes(settings, memory::extent(settings, size))
     }
 
     /// The additional memory of [`Denoiser::keep_activations`] for a view.
-    #[cfg(feature = "testing")]
     pub fn kept_bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
         EarlierStages::bytes(settings, memory::extent(settings, size))
     }

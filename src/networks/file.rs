@@ -3,13 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
+use nightsplat_core::input;
+use nightsplat_core::output::write_whole;
 use safetensors::SafeTensorError;
 use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorInfo, TensorView};
 use serde_json::Value;
 
 use super::parameters::{Parameters, Tensor};
-use crate::base::input;
-use crate::base::output::write_whole;
 use crate::gpu::Gpu;
 use crate::{Error, Result};
 

@@ -3,12 +3,12 @@
 use std::path::Path;
 
 use glam::UVec2;
+use nightsplat_core::input;
+use nightsplat_photographs::image::Image;
 
-use crate::base::input;
 use crate::gpu::Gpu;
 pub use crate::networks::Network;
 use crate::networks::{TensorFile, Trunk, published};
-use crate::photographs::image::Image;
 use crate::{Error, Result};
 
 /// The normalisation of the network's input: minus `SHIFT`, over `SCALE`, for each channel. It is meant for [-1, 1].

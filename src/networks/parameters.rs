@@ -1,8 +1,9 @@
 //! The parameters of a network: one flat array on the device, and the table of the tensors in it.
 
+use nightsplat_core::random::Stream;
+
 use super::{NetworkVariant, RGB};
 use crate::Result;
-use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu};
 use crate::splats::optimizer::{AdamBuffers, Learnable, Moments};
 

@@ -1,6 +1,7 @@
 //! The tonemapper: three convolutions from illumination times denoised image to the dark photograph.
 
 use glam::UVec2;
+use nightsplat_core::random::Stream;
 
 use super::conv::{
     AccumulateInto, Activation, Backward, Conv, Layer, Precision, Strips, partial_count,
@@ -10,7 +11,6 @@ use super::relu::ReluBackward;
 use super::reserved::{Extent, Reserved};
 use super::{NetworkVariant, RGB, check_binding};
 use crate::Result;
-use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{product, product_backward};
 

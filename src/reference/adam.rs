@@ -1,10 +1,11 @@
+use nightsplat_photographs::tone::Real;
+
 use super::random::random_bits;
 use super::rounding::Rounded;
 use crate::gpu::Reference;
 use crate::kernels::adam::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::adam_step::{BETA1, BETA2, EPSILON, GRADIENT_BOUND};
 use crate::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
-use crate::photographs::tone::Real;
 use crate::splats::attributes::{Attribute, planes};
 use crate::splats::batches::frozen_floats;
 

@@ -1,11 +1,11 @@
 //! `CIConv`: the columns pass and the invariant.
 
 use glam::Vec3;
+use nightsplat_photographs::tone::Real;
 
 use super::ciconv_rows::taps;
 use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::ciconv_columns::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::Real;
 
 /// ln(W + 1e-5) of every pixel.
 fn log_invariants(params: &Params, smooth_rows: &[Vec3], slope_rows: &[Vec3]) -> Vec<Rounded> {

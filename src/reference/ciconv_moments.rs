@@ -1,8 +1,8 @@
 use glam::Vec2;
+use nightsplat_photographs::tone::Real;
 
 use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::ciconv_moments::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::Real;
 
 /// Mean and 1 / standard deviation, from the moments of the workgroups.
 fn norm(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {

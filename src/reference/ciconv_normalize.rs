@@ -1,6 +1,7 @@
+use nightsplat_photographs::tone::Real;
+
 use super::rounding::{Rounded, bounded_reference};
 use crate::kernels::ciconv_normalize::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::Real;
 
 /// The structure at every pixel.
 fn structure(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {

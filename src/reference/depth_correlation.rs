@@ -1,8 +1,9 @@
 //! The Pearson loss, in any number type.
 
+use nightsplat_photographs::tone::Real;
+
 use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::depth_correlation::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::Real;
 
 /// P, and the factors of a - mean a and b - mean b in its gradient with respect to a.
 #[derive(Clone, Copy, Debug)]

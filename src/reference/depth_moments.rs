@@ -1,6 +1,7 @@
+use nightsplat_photographs::tone::Real;
+
 use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::depth_moments::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::Real;
 
 /// Means of a and b, then the sums of aa, ab and bb about them, of every chunk.
 fn moments(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {

@@ -1,9 +1,10 @@
 //! Application of an exposure, in any number type.
 
+use nightsplat_photographs::tone::Real;
+
 use super::rounding::{Rounded, bounded_reference};
 use crate::kernels::expose::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::exposure::{BIAS_SCALE, CLIPPED_REACH, EXPOSURE_WIDTH};
-use crate::photographs::tone::Real;
 
 /// Gain and bias of a channel of a view, in any number type.
 pub fn gain_and_bias<T: Real>(exposures: &[T], view: usize, channel: usize) -> [T; 2] {

@@ -1,7 +1,8 @@
+use nightsplat_photographs::tone::Real;
+
 use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use crate::kernels::exposure_gradient::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::Real;
 
 /// The gradient of every number of every view.
 fn gradients(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {

@@ -1,6 +1,7 @@
+use nightsplat_photographs::tone::Real;
+
 use super::rounding::{Rounded, bounded_reference};
 use crate::kernels::mask_render::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::Real;
 
 /// Every value written.
 fn shown(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {

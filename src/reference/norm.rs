@@ -1,9 +1,10 @@
 //! The norm of one channel, in any number type: statistics of the image itself, biased variance, affine, `ReLU`.
 
+use nightsplat_photographs::tone::Real;
+
 use super::rounding::{Gated, Rounded};
 use crate::kernels::ChannelStatistics;
 use crate::kernels::norm_merge::EPSILON;
-use crate::photographs::tone::Real;
 
 /// Mean and 1 / standard deviation.
 #[derive(Clone, Copy, Debug)]
@@ -23,7 +24,6 @@ pub struct NormAffine<T = f64> {
     pub beta: T,
 }
 
-#[cfg(feature = "testing")]
 impl NormStatistics {
     /// Those of a channel's values.
     pub fn from_values(values: &[f64]) -> Self {
@@ -75,7 +75,6 @@ pub fn backward_terms<T: Gated>(
 }
 
 /// The sums over the values of `d_y` and of `d_y` n: the gradients of beta and of gamma.
-#[cfg(feature = "testing")]
 pub fn backward_sums(
     statistics: NormStatistics,
     affine: NormAffine,

@@ -1,7 +1,8 @@
+use nightsplat_photographs::tone::Real;
+
 use super::norm::{affine, backward, plane};
 use super::rounding::{Rounded, bounded_reference};
 use crate::kernels::norm_backward::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::Real;
 
 /// The gradient of every value of every channel.
 fn d_source(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {

@@ -1,8 +1,9 @@
+use nightsplat_photographs::tone::Real;
+
 use super::norm::NormStatistics;
 use super::rounding::{Rounded, bounds_from, chain, write};
 use crate::gpu::Reference;
 use crate::kernels::norm_merge::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::Real;
 
 /// Mean and 1 / standard deviation of every channel.
 fn merged(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Rounded> {

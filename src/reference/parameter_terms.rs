@@ -2,10 +2,11 @@
 
 use std::ops::Range;
 
+use nightsplat_photographs::tone::Real;
+
 use super::rounding::{Rounded, chain, sum_tolerance, write, write_sum};
 use crate::gpu::Reference;
 use crate::kernels::parameter_terms::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::Real;
 use crate::splats::attributes::Attribute;
 use crate::splats::batches::frozen_floats;
 
@@ -32,7 +33,6 @@ fn extremes<T: PartialOrd + Copy>(log_scales: [T; 3]) -> [usize; 2] {
 
 /// The three weights, of opacity, standard deviation and anisotropy, times the means over the Gaussians with these
 /// planes, and the gradient. `log_ratio` is the logarithm of the largest ratio without a loss.
-#[cfg(feature = "testing")]
 pub fn parameter_terms(
     planes: &[f64],
     gaussian_count: usize,

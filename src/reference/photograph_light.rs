@@ -1,10 +1,11 @@
 //! A render in the values of its photographs, by the inverse of the host.
 
+use nightsplat_photographs::tone::InverseTone;
+
 use super::rounding::{Rounded, UNIT, rounded_tone_curve};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::curves::{CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL};
 use crate::kernels::photograph_light::{Constants, Kernel, PRECISION, Params, Slices, Tolerances};
-use crate::photographs::tone::InverseTone;
 
 /// Roundings of the curve and of the quotient by alpha, in values of at most 1.
 const ROUNDINGS: f64 = 32.0;

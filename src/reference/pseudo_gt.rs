@@ -1,3 +1,5 @@
+use nightsplat_photographs::tone::{Real, bounded, profiled, shoulder, table_at, toe};
+
 use super::rounding::{Rounded, rounded_tone_curve};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ToneParameters;
@@ -5,7 +7,6 @@ use crate::kernels::curves::{
     CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_PROFILE, CURVE_TABLE,
 };
 use crate::kernels::pseudo_gt::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::photographs::tone::{Real, bounded, profiled, shoulder, table_at, toe};
 
 /// The largest value that a curve of several channels takes.
 const LARGEST: f32 = 65504.0;

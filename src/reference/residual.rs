@@ -4,7 +4,6 @@ use crate::gpu::Reference;
 use crate::kernels::residual::{Constants, Kernel, Params, Slices};
 
 /// clamp(`R_0` - (I + u), 0, 1).
-#[cfg(feature = "testing")]
 pub fn residual(render: f64, stage_input: f64, update: f64) -> f64 {
     (render - (stage_input + update)).clamp(0.0, 1.0)
 }

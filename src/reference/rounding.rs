@@ -5,10 +5,10 @@ use std::cmp::Ordering;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
 use bytemuck::Pod;
+use nightsplat_photographs::tone::{Real, curve_at, mirrored};
 
 use crate::gpu::Tolerance;
 use crate::kernels::ToneParameters;
-use crate::photographs::tone::{Real, curve_at, mirrored};
 
 /// The relative error of one rounding; half a unit in the last place (ulp).
 pub const UNIT: f64 = f32::EPSILON as f64 / 2.0;
@@ -326,8 +326,8 @@ impl Real for Rounded {
 #[cfg(test)]
 mod tests {
     use super::{Rounded, UNIT};
-    use crate::base::random::Stream;
-    use crate::photographs::tone::Real;
+    use nightsplat_core::random::Stream;
+    use nightsplat_photographs::tone::Real;
 
     /// A formula with every operation, in any number type.
     fn formula<T: Real>(x: T, y: T) -> T {

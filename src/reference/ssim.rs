@@ -1,13 +1,13 @@
 //! SSIM and the gradient of L1 + SSIM, in any number type; the kernel's reference rounds the results.
 
 use glam::UVec2;
+use nightsplat_photographs::tone::Real;
 
 use super::inside;
 use super::rounding::{Rounded, UNIT, chain, sum_tolerance, write, write_sum};
 use crate::gpu::Reference;
 use crate::kernels::ssim::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::ssim_window::{C1, C2};
-use crate::photographs::tone::Real;
 
 /// SSIM at one pixel of one channel and its derivatives with respect to the blurred moments.
 #[derive(Clone, Copy, Debug, Default)]
@@ -41,14 +41,12 @@ fn blur(width: usize, height: usize, plane: &[f64]) -> Vec<f64> {
 }
 
 /// SSIM of every pixel of one channel, `a` against `b`.
-#[cfg(feature = "testing")]
 pub fn ssim(size: [usize; 2], a: &[f64], b: &[f64]) -> Vec<f64> {
     let [a, b] = [a, b].map(double);
     rounded_ssim(size, &a, &b, |_| true).iter().map(|of| of.value.value).collect()
 }
 
 /// Numbers in double precision.
-#[cfg(feature = "testing")]
 fn double(plane: &[f64]) -> Vec<Rounded> {
     plane.iter().map(|&x| Rounded::from_f64(x)).collect()
 }
@@ -68,7 +66,6 @@ fn ssim_of_moments<T: Real>(a: T, b: T, aa: T, bb: T, ab: T) -> SsimPixel<T> {
 
 /// The gradient of `l1_scale` sum|a - b| - `ssim_scale` sum SSIM with respect to one channel of the render `a`, sums
 /// over the pixels from `begin` to before `end`.
-#[cfg(feature = "testing")]
 pub fn gradient(
     size: [usize; 2],
     loss_region: [UVec2; 2],

@@ -1,6 +1,6 @@
 //! Numbers as colours.
 
-use crate::photographs::image::Image;
+use nightsplat_photographs::image::Image;
 
 /// Viridis, at nine even places, sRGB.
 const VIRIDIS: [[u8; 3]; 9] = [

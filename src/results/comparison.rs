@@ -2,6 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::metrics::Scores;
 use serde_json::{Value, json};
 
 use super::eval::{After, Evaluation, Extras, Metric, ScoreReference, ScoredImages};
@@ -9,9 +12,6 @@ use super::finished_run::{FinishedRun, Opener, is_model};
 use super::report::{Best, Column, Comparison, NumberTable, Picture, Report, TextTable};
 use super::run;
 use crate::networks::lpips::{Lpips, LpipsVersion, Range};
-use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::image::Image;
-use crate::photographs::metrics::Scores;
 use crate::train::{TrainConfig, values};
 use crate::{Error, Result};
 

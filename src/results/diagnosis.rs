@@ -1,9 +1,10 @@
 //! A diagnosis as a table, as lines and as a page: the plan, measurements, and photographs with their targets.
 
-use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::image::Image;
-use crate::photographs::targets::SceneTone;
-use crate::photographs::tone::{ToneSettings, luminance};
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tone::{ToneSettings, luminance};
+
 use crate::results::linear_light::target_of;
 use crate::results::report::{
     Best, Column, Comparison, Distribution, NumberTable, Picture, Report, TextTable, distributions,

@@ -17,6 +17,10 @@ use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
+use nightsplat_core::camera::enclosing_sphere;
+use nightsplat_core::output::{create_folder_of, is_same_file, write_whole};
+use nightsplat_core::ply::PlyHeader;
+use nightsplat_photographs::tree::check_writable;
 
 use self::capture::ModelPhotographs;
 use self::content::Content;
@@ -24,15 +28,11 @@ use self::evidence::Measured;
 use self::floaters::{CameraPositions, Floaters};
 use self::placement::Placement;
 use self::step::Step;
-use crate::base::output::{check_writable, create_folder_of, is_same_file, write_whole};
-use crate::base::ply::PlyHeader;
-use crate::camera::enclosing_sphere;
 use crate::results::export::{EDITS, Format, Provenance};
 use crate::results::finished_run::{Opener, is_model};
 use crate::results::{models, run};
 use crate::splats::scene::{Features, Gaussians, ModelFacts, Shape, is_far};
 use crate::{Error, Result};
-
 pub(crate) use operation::{EditList, Operation, Region, Scale, fingerprint};
 
 /// A model while it is edited.

@@ -4,21 +4,23 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use crate::base::output::own_file;
-use crate::camera::{Camera, TrainingFrame};
+use nightsplat_core::camera::{Camera, TrainingFrame};
+use nightsplat_core::output::own_file;
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
+use nightsplat_photographs::metrics::{self, Scores, psnr_of_counted};
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::lpips::Lpips;
-use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
-use crate::photographs::metrics::{self, Scores, psnr_of_counted};
-use crate::photographs::targets::{SceneTone, Targets};
-use crate::photographs::tone::{ToneCurve, ToneSettings};
 use crate::results::linear_light::{photograph_of, slope_at, stops_between};
 use crate::splats::lamp::Lamp;
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::{DeviceGaussians, Shape};
+use crate::targets::Targets;
 use crate::train::{Networks, Rendered, TrainConfig};
 use crate::{Error, Result};
 
@@ -398,7 +400,6 @@ impl Evaluation {
 }
 
 /// Scores every test view that has a reference image; `render` renders a view.
-#[cfg(feature = "testing")]
 pub fn score(
     dataset: &Dataset,
     render: impl FnMut(&View) -> Result<Rendered>,

@@ -2,6 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::csv;
+use nightsplat_photographs::dataset::View;
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::metrics::Scores;
+use nightsplat_photographs::scene_tone::SceneTone;
 use serde_json::Value;
 
 use super::eval::{
@@ -11,12 +16,7 @@ use super::finished_run::{FinishedRun, Opener, is_model};
 use super::report::{Chart, Comparison, Picture, Report, Series};
 use super::run;
 use crate::Result;
-use crate::base::csv;
 use crate::networks::lpips::{Lpips, Range};
-use crate::photographs::dataset::View;
-use crate::photographs::image::Image;
-use crate::photographs::metrics::Scores;
-use crate::photographs::targets::SceneTone;
 use crate::train::{TrainConfig, known_stops};
 
 /// Maximum width of an image, pixels.

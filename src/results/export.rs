@@ -17,8 +17,8 @@ use std::str::FromStr;
 
 use flate2::{Compression, GzBuilder};
 use glam::{DMat3, DQuat, DVec3, Vec3};
+use nightsplat_core::output::write_whole;
 
-use crate::base::output::write_whole;
 use crate::splats::model::Model;
 use crate::splats::scene::{Gaussians, ModelFacts, ply};
 use crate::{Error, Result};
@@ -297,9 +297,9 @@ fn gzip_with(bytes: &[u8], comment: Option<String>) -> Result<Vec<u8>> {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::base::random::Stream;
     use crate::splats::harmonics::sh_basis;
     use crate::splats::scene::Shape;
+    use nightsplat_core::random::Stream;
 
     /// Random Gaussians of ordinary values.
     pub(crate) fn drawn(count: usize, sh_degree: u32) -> Gaussians {

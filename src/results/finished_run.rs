@@ -3,9 +3,10 @@
 use std::ffi::OsStr;
 use std::path::Path;
 
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::photographs::dataset::Dataset;
-use crate::photographs::tone::{ToneCurve, ToneSettings};
 use crate::results::eval::ModelRenderer;
 use crate::results::{models, run};
 use crate::splats::lamp::Lamp;

@@ -1,10 +1,10 @@
 //! Images in the light of the photographs.
 
 use glam::DVec3;
+use nightsplat_photographs::image::{Image, linear_from_srgb, srgb_from_linear};
+use nightsplat_photographs::tone::{InverseTone, Inverted};
 use rayon::prelude::*;
 
-use crate::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
-use crate::photographs::tone::{InverseTone, Inverted};
 use crate::splats::harmonics::{quadrature, sh_basis};
 use crate::splats::scene::{Gaussians, rest_coefficients};
 
@@ -144,9 +144,9 @@ impl Clipped {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::photographs::metrics::psnr_of_counted;
-    use crate::photographs::targets::SceneTone;
-    use crate::photographs::tone::{MeasuredPhotograph, Tone, ToneSettings};
+    use nightsplat_photographs::metrics::psnr_of_counted;
+    use nightsplat_photographs::scene_tone::SceneTone;
+    use nightsplat_photographs::tone::{MeasuredPhotograph, Tone, ToneSettings};
 
     #[test]
     fn the_colours_of_gaussians_become_their_light_in_every_direction() {

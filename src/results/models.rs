@@ -2,10 +2,11 @@
 
 use std::path::Path;
 
+use nightsplat_core::error::Error;
+use nightsplat_core::input;
+use nightsplat_core::ply::CONVERTER;
+
 use crate::Result;
-use crate::base::input;
-use crate::base::ply::CONVERTER;
-use crate::error::Error;
 use crate::results::export::{sog, spz};
 use crate::results::run;
 use crate::splats::model::{FileKind, Model};

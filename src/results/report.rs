@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use crate::photographs::image::Image;
+use nightsplat_photographs::image::Image;
 
 pub use self::chart::{Chart, Mark, Series, VerticalLine};
 pub(crate) use self::data_uri::{base64, jpeg};

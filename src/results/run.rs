@@ -12,7 +12,6 @@ mod lock;
 mod meter;
 mod progress;
 mod requests;
-#[cfg(feature = "cli")]
 mod tail;
 mod tensorboard;
 mod train;
@@ -28,6 +27,5 @@ pub use load::{
 };
 pub use meter::{ResourceUsage, energy_counters};
 pub use requests::Requests;
-#[cfg(feature = "cli")]
 pub(crate) use tail::{Stamp, WatchedRun, stamp};
 pub use train::{IfExists, Session, train, train_in};

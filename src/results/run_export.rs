@@ -7,11 +7,11 @@ use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use glam::{DQuat, DVec3};
+use nightsplat_core::output::{create_folder_of, is_same_file, own_file, write_whole};
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::scene_tone::SceneTone;
 
 use self::up::{Turn, Up};
-use crate::base::output::{create_folder_of, is_same_file, own_file, write_whole};
-use crate::photographs::dataset::Dataset;
-use crate::photographs::targets::SceneTone;
 use crate::results::export::streamed::{self, Division, TileLoader, Written};
 use crate::results::export::{Format, Provenance};
 use crate::results::finished_run::{Opener, config_of_file, is_model, needs_photographs};

@@ -1,12 +1,12 @@
 //! Summary of a run, printed before its first step.
 
+use nightsplat_core::output::one_line;
+use nightsplat_photographs::dataset::{Dataset, Split, View};
+use nightsplat_photographs::tone::{Tone, ToneCurve};
 use serde::Serialize;
 
 use super::eval::{ReferenceKind, ScoreReference};
-use crate::base::output::one_line;
 use crate::gpu::Gpu;
-use crate::photographs::dataset::{Dataset, Split, View};
-use crate::photographs::tone::{Tone, ToneCurve};
 use crate::train::TrainConfig;
 use crate::train::diagnose::Plan;
 

@@ -4,8 +4,9 @@ use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use crate::base::output::write_whole;
-use crate::photographs::image::Image;
+use nightsplat_core::output::write_whole;
+use nightsplat_photographs::image::{Image, ImageFile};
+
 use crate::{Error, Result};
 
 /// Makes a video of `files`.

@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::tone::exposure_knots;
+
 use super::run;
 use crate::loss::exposure::Affine;
-use crate::photographs::image::Image;
-use crate::photographs::tone::exposure_knots;
 use crate::{Error, Result};
 
 /// The exposures of the training views relative to that of the model.

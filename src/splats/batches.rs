@@ -80,8 +80,7 @@ impl Batches {
 
     /// The layout of the gradients and moments of the same Gaussians if their first `columns` columns are not trained.
     /// It has no memory for these; they are read as 0.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn without(self, columns: u32) -> Self {
+    pub fn without(self, columns: u32) -> Self {
         Self { frozen: columns, ..self }
     }
 
@@ -109,7 +108,6 @@ impl Batches {
     }
 
     /// A buffer of planes in batches, from the planes of all Gaussians.
-    #[cfg(feature = "testing")]
     pub fn upload(&self, gpu: &Gpu, name: &str, planes: &[f32]) -> Result<Buffer<f32>> {
         let mut buffer = self.uninit(gpu, name)?;
         self.write(gpu, &mut buffer, planes)?;

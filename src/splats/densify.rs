@@ -11,9 +11,9 @@
 
 use std::str::FromStr;
 
+use nightsplat_core::camera::{Camera, Patch};
 use serde::{Deserialize, Serialize};
 
-use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu, Pipeline, Threads};
 use crate::kernels::densify_action::{
     COUNTER_CANDIDATES, COUNTER_CLONED, COUNTER_PRUNED, COUNTER_SPLIT, COUNTER_WORDS,

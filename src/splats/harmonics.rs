@@ -96,7 +96,7 @@ impl HarmonicRotation {
     }
 }
 
-#[cfg(all(test, feature = "io"))]
+#[cfg(all(test, feature = "train"))]
 mod tests {
     use glam::DQuat;
     use nalgebra::{DMatrix, DVector};

@@ -3,10 +3,10 @@
 
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::input;
+use nightsplat_photographs::dataset::block::Cell;
 use serde::{Deserialize, Serialize};
 
-use crate::base::input;
-use crate::photographs::dataset::block::Cell;
 use crate::splats::scene::{Gaussians, ply};
 use crate::{Error, Result};
 

@@ -1,7 +1,6 @@
 //! A lamp that moves with the camera, on the host; `include/lamp.glsl` has its formula.
 
 use glam::DVec3;
-#[cfg(feature = "io")]
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
@@ -10,7 +9,6 @@ use crate::kernels::lamp::{
     LAMP_LARGEST_EXPONENT, LAMP_LEAST_AMBIENT, LAMP_NEAREST, LAMP_NUMBERS, LAMP_REACH,
     LAMP_REFERENCE_DISTANCE, LAMP_SLOPE, LAMP_STEP,
 };
-#[cfg(feature = "io")]
 use crate::kernels::lamp::{LAMP_KNEE, LAMP_LEFT};
 use crate::{Error, Result};
 
@@ -94,7 +92,6 @@ impl Lamp {
     }
 
     /// The colour of a Gaussian without the light at a point in view space.
-    #[cfg(feature = "io")]
     pub(crate) fn unlit(&self, color: Vec3, point: DVec3) -> Vec3 {
         let factor = self.factor(point);
         let unlit =
@@ -103,7 +100,6 @@ impl Lamp {
     }
 
     /// The colour of the tone curve's argument `x`, which is in proportion to light^slope.
-    #[cfg(feature = "io")]
     pub(crate) fn tone(&self, x: f64) -> f64 {
         let bent = x / self.reach;
         if self.reach == 0.0 || bent < 0.0 {
@@ -114,7 +110,6 @@ impl Lamp {
     }
 
     /// The argument of the tone curve for a colour: the inverse of [`Lamp::tone`].
-    #[cfg(feature = "io")]
     pub(crate) fn tone_inverse(&self, value: f64) -> f64 {
         let above = value - self.black;
         let share = above / self.reach;
@@ -127,7 +122,6 @@ impl Lamp {
 
     /// The same lamp with this light as the unit, and the distance where it is on the axis as the reference distance;
     /// unchanged if that is farther off than a factor of four, or nowhere.
-    #[cfg(feature = "io")]
     #[must_use]
     pub(crate) fn in_units_of(&self, light: f64) -> Self {
         let ambient = self.ambient / light;
@@ -153,8 +147,8 @@ impl Lamp {
     }
 
     /// Refuses numbers out of range.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn check(&self) -> Result<()> {
+    #[doc(hidden)]
+    pub fn check(&self) -> Result<()> {
         let Self { position, axis, ambient, exponent, falloffs, .. } = *self;
         let Self { reference_distance, slope, black, reach, .. } = *self;
         let is_finite = position.iter().chain(&axis).all(|x| x.abs() < 1e9);
@@ -180,8 +174,8 @@ impl Lamp {
     }
 
     /// The numbers of the device; ambient, exponent and falloffs at a bound are next to it.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn numbers(&self) -> [f32; LAMP_NUMBERS as usize] {
+    #[doc(hidden)]
+    pub fn numbers(&self) -> [f32; LAMP_NUMBERS as usize] {
         let mut numbers = [0.0; LAMP_NUMBERS as usize];
         let position = self.position.map(|x| x / (LAMP_STEP * self.reference_distance));
         numbers[..3].copy_from_slice(&position);
@@ -282,7 +276,6 @@ mod tests {
     }
 
     #[test]
-    #[cfg(feature = "io")]
     fn another_unit_of_light_changes_no_ratio() {
         let other = lamp().in_units_of(0.6);
         for point in [DVec3::Z, DVec3::new(0.5, -0.3, 2.0), DVec3::new(-1.0, 0.3, 0.4)] {
@@ -294,7 +287,6 @@ mod tests {
     }
 
     #[test]
-    #[cfg(feature = "io")]
     fn the_tone_curve_has_an_inverse_on_both_sides_of_black_and_of_its_knee() {
         for reach in [0.0, 0.5, 0.9] {
             let lamp = Lamp { black: 0.07, reach, ..lamp() };

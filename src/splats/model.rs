@@ -2,21 +2,17 @@
 
 use std::borrow::Cow;
 
-#[cfg(feature = "capi")]
 use glam::{DAffine3, DQuat};
+use nightsplat_core::camera::deviation_from_rigid;
+use nightsplat_core::curves::SceneLaw;
+#[cfg(any(test, not(feature = "train")))]
+use nightsplat_core::input;
 
-#[cfg(any(test, not(feature = "io")))]
-use crate::base::input;
-#[cfg(feature = "capi")]
-use crate::camera::deviation_from_rigid;
-use crate::photographs::tone::SceneLaw;
 use crate::splats::render::RenderSettings;
-#[cfg(feature = "capi")]
 use crate::splats::scene::Features;
-#[cfg(any(test, not(feature = "io")))]
+#[cfg(any(test, not(feature = "train")))]
 use crate::splats::scene::ply;
 use crate::splats::scene::{Gaussians, ModelFacts};
-#[cfg(any(test, feature = "capi", not(feature = "io")))]
 use crate::{Error, Result};
 
 /// A model with what a renderer must know of it.
@@ -95,8 +91,8 @@ impl Model {
     /// One model of several, each turned and moved by a rigid pose, so that all are sorted together. Near plane, alpha
     /// limit and colours are the first one's, and its law where all have it; positions are relative to its origin, and
     /// to none where they are moved.
-    #[cfg(feature = "capi")]
-    pub(crate) fn join(parts: &[(&Self, DAffine3)]) -> Result<Self> {
+    #[doc(hidden)]
+    pub fn join(parts: &[(&Self, DAffine3)]) -> Result<Self> {
         let [(first, _), ..] = parts else {
             return Err(Error::Usage("no models to join; pass at least one".to_owned()));
         };
@@ -151,24 +147,24 @@ impl Model {
         }
     }
 
-    /// Reads a model: a PLY in the INRIA layout, recognised by its content. A build with the feature `io` reads SPZ,
+    /// Reads a model: a PLY in the INRIA layout, recognised by its content. A build with the feature `train` reads SPZ,
     /// SOG and run directories as well.
     ///
     /// The near plane, the alpha limit and the colours are those that the file states (`comment nightsplat near 0.1`),
     /// and else those of [`RenderSettings::default`].
     ///
     /// # Errors
-    /// [`Error::Input`] where the file is missing, no model, cut short or not finite, or needs the feature `io`.
-    #[cfg(not(feature = "io"))]
+    /// [`Error::Input`] where the file is missing, no model, cut short or not finite, or needs the feature `train`.
+    #[cfg(not(feature = "train"))]
     pub fn load(path: impl AsRef<std::path::Path>) -> Result<Self> {
         load_ply(path.as_ref())
     }
 }
 
-/// What a build without the feature `io` reads.
-#[cfg(any(test, not(feature = "io")))]
+/// What a build without the feature `train` reads.
+#[cfg(any(test, not(feature = "train")))]
 fn load_ply(path: &std::path::Path) -> Result<Model> {
-    const REMEDY: &str = "is read by a build with the feature `io`; export it to PLY";
+    const REMEDY: &str = "is read by a build with the feature `train`; export it to PLY";
     if path.is_dir() {
         return Err(Error::input(path, format!("is a folder; a run directory {REMEDY}")));
     }
@@ -222,7 +218,7 @@ mod tests {
             std::fs::write(&path, bytes).unwrap();
             load_ply(&path).unwrap_err().to_string()
         };
-        let remedy = "is read by a build with the feature `io`; export it to PLY";
+        let remedy = "is read by a build with the feature `train`; export it to PLY";
         assert!(refused(b"NGSP").ends_with(&format!("model: SPZ {remedy}")));
         assert!(refused(b"PK\x03\x04").ends_with(&format!("model: SOG {remedy}")));
         assert!(refused(b"solid").contains("is not a PLY file"));

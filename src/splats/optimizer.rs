@@ -122,7 +122,6 @@ impl<P> Moments<P> {
 
 impl<'a> Moments<SliceMut<'a, f32>> {
     /// Reborrows them.
-    #[cfg(feature = "io")]
     fn reborrow(&mut self) -> Moments<SliceMut<'_, f32>> {
         self.as_mut().map(SliceMut::reborrow)
     }
@@ -157,7 +156,6 @@ pub struct AdamBuffers<'a> {
 
 impl AdamBuffers<'_> {
     /// Reborrows them.
-    #[cfg(feature = "io")]
     pub(crate) fn reborrow(&mut self) -> AdamBuffers<'_> {
         let Self { parameters, gradients, moments } = self;
         AdamBuffers {
@@ -209,15 +207,13 @@ pub(crate) struct GaussianStep<'a> {
 
 impl Adam {
     /// [`Adam::with_frozen`] without frozen columns.
-    #[cfg(any(test, feature = "testing"))]
     pub fn new(gpu: &Gpu) -> Result<Self> {
         Self::with_frozen(gpu, 0)
     }
 
     /// Builds the kernel, which leaves the first columns of Gaussians as they are; those for packed coefficients are
     /// built on first use.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn with_frozen(gpu: &Gpu, frozen_columns: u32) -> Result<Self> {
+    pub fn with_frozen(gpu: &Gpu, frozen_columns: u32) -> Result<Self> {
         let adam = Self {
             gpu: gpu.clone(),
             floats: Default::default(),
@@ -243,8 +239,7 @@ impl Adam {
     }
 
     /// [`Adam::record`] for Gaussians, whose frozen columns have neither gradients nor moments.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn record_trained(
+    pub fn record_trained(
         &self,
         pass: &mut Recorder<'_>,
         step: AdamStep<'_>,

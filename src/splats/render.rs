@@ -11,12 +11,12 @@
 mod buffers;
 mod cameras;
 mod capacity;
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 mod context;
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 mod depths;
 mod draw;
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 mod gradients;
 mod images;
 mod lamp;
@@ -25,6 +25,7 @@ mod pipelines;
 mod settings;
 mod target;
 
+use crate::splats::camera::model_number;
 use std::collections::BTreeMap;
 
 use glam::{UVec2, Vec2};
@@ -46,7 +47,7 @@ use buffers::{RANKS_PER_PARTITION, color_floats};
 pub use cameras::{Viewpoint, Viewpoints};
 pub use draw::Drawn;
 use draw::HostTargets;
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 pub(crate) use gradients::ViewGradients;
 pub(crate) use lamp::DeviceLamp;
 use pipelines::{ProjectionKind, Projections, WrittenGradients};
@@ -124,13 +125,12 @@ struct DepthChannel {
 
 impl Renderer {
     /// The number of intersections of the last render; waits for it.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn intersections(&self) -> Result<u32> {
+    #[doc(hidden)]
+    pub fn intersections(&self) -> Result<u32> {
         Ok(self.gpu.read(&self.frame.counts)?[0])
     }
 
     /// The settings that it was made with.
-    #[cfg(feature = "io")]
     pub(crate) fn settings(&self) -> &RenderSettings {
         &self.settings
     }
@@ -167,8 +167,8 @@ impl Renderer {
     }
 
     /// The last render and the status words, for a loss that reads the former and sets flags in the latter.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn render_and_status(&mut self) -> (&Buffer<f32>, &mut Buffer<u32>) {
+    #[doc(hidden)]
+    pub fn render_and_status(&mut self) -> (&Buffer<f32>, &mut Buffer<u32>) {
         (&self.frame.render, &mut self.frame.status)
     }
 
@@ -500,7 +500,7 @@ impl Renderer {
             let what = format!("a {width}x{height} image exceeds what the renderer reserved");
             return Err(Error::Usage(what));
         }
-        let kind = ProjectionKind { camera_model: patch.camera.model.number(), view_depths };
+        let kind = ProjectionKind { camera_model: model_number(&patch.camera.model), view_depths };
         self.build_projections(kind)?;
         let (cameras, camera_index) = on_device.unzip();
         let camera_index = camera_index.unwrap_or_default();

@@ -6,27 +6,26 @@ use std::ops::Range;
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use rayon::prelude::*;
 
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 mod change;
 mod device;
 mod facts;
 mod features;
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 pub mod init;
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 mod neighbours;
 pub mod ply;
 
-#[cfg(feature = "io")]
-use crate::camera::TrainingFrame;
 pub use crate::splats::attributes::{ATTRIBUTES, Attribute, PlaneCounts, rest_coefficients};
 use crate::splats::attributes::{AttributePlane, column_count, planes};
 use crate::splats::harmonics::HarmonicRotation;
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 pub(crate) use change::{Lengths, is_far};
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
 pub use facts::ModelFacts;
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
+use nightsplat_core::camera::TrainingFrame;
 
 pub use crate::kernels::sh::MAX_SH_DEGREE;
 
@@ -93,8 +92,8 @@ impl Gaussians {
     }
 
     /// The range of an attribute in [`Gaussians::parameters`].
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn plane(&self, attribute: Attribute) -> Range<usize> {
+    #[doc(hidden)]
+    pub fn plane(&self, attribute: Attribute) -> Range<usize> {
         let AttributePlane { column, width, .. } = self.columns(attribute);
         column * self.count..(column + width) * self.count
     }
@@ -106,7 +105,6 @@ impl Gaussians {
 
     /// The Gaussians transformed from the training frame to the world, relative to an origin that f32 can represent:
     /// [`TrainingFrame::file_origin`].
-    #[cfg(feature = "io")]
     pub(crate) fn to_world(&self, frame: &TrainingFrame) -> Self {
         let origin = frame.file_origin();
         if *frame == TrainingFrame::WORLD {
@@ -118,7 +116,6 @@ impl Gaussians {
     }
 
     /// Gaussians of the world in the training frame: the inverse of [`Gaussians::to_world`].
-    #[cfg(feature = "io")]
     pub(crate) fn to_frame(&self, frame: &TrainingFrame) -> Self {
         if *frame == TrainingFrame::WORLD && self.origin == DVec3::ZERO {
             return self.clone();
@@ -142,8 +139,8 @@ impl Gaussians {
     }
 
     /// The Gaussians with these features: new ones are zero, others are dropped.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn with_features(&self, features: Features) -> Self {
+    #[doc(hidden)]
+    pub fn with_features(&self, features: Features) -> Self {
         let mut other = Self::zeros(self.count, Shape { features, ..self.shape });
         other.origin = self.origin;
         let kept = |attribute: &Attribute| *attribute != Attribute::Features;
@@ -216,7 +213,6 @@ impl Gaussians {
     }
 
     /// Replaces the Gaussians from `first` on by others of the same shape.
-    #[cfg(any(feature = "io", feature = "capi"))]
     pub(crate) fn replace(&mut self, first: usize, by: &Self) {
         for spec in &ATTRIBUTES {
             let width = self.columns(spec.attribute).width;
@@ -227,8 +223,8 @@ impl Gaussians {
     }
 
     /// Adds a constant to the colour from every direction.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn shift_colors(&mut self, by: f32) {
+    #[doc(hidden)]
+    pub fn shift_colors(&mut self, by: f32) {
         for dc in self.dc_mut() {
             *dc += by / SH_C0;
         }

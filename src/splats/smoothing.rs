@@ -1,7 +1,8 @@
 //! The smoothing floor: no Gaussian is smaller than what the finest training view of it resolves.
 
+use nightsplat_core::camera::{Camera, Patch};
+
 use crate::Result;
-use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{self, smoothing_floor};
 use crate::splats::scene::DeviceGaussians;

@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use serde::{Deserialize, Serialize};
 
 use crate::gpu::Gpu;
-use crate::photographs::pseudo_gt::EncodedPlanes;
+use crate::targets::pseudo_gt::EncodedPlanes;
 use crate::{Error, Result};
 
 /// The default share of photographs in the memory of the device and of the host.
@@ -329,9 +329,9 @@ mod tests {
     use super::super::precision::Encoder;
     use super::*;
     use crate::gpu::testing::gpu;
-    use crate::photographs::pseudo_gt::PseudoGt;
-    use crate::photographs::tone::ToneSettings;
+    use crate::targets::pseudo_gt::PseudoGt;
     use crate::train::PhotographBits;
+    use nightsplat_photographs::tone::ToneSettings;
 
     #[test]
     fn sizes_are_read_with_and_without_units() {

@@ -7,6 +7,10 @@
 use std::collections::HashMap;
 use std::path::Path;
 
+use nightsplat_core::hash::{self, Hasher};
+use nightsplat_core::input;
+use nightsplat_core::output::write_whole_with;
+use nightsplat_photographs::dataset::Fingerprint;
 use rayon::prelude::*;
 use safetensors::tensor::{Dtype, TensorView};
 use serde::{Deserialize, Serialize};
@@ -16,13 +20,9 @@ use super::decisions::Decisions;
 use super::lamp::LEARNED;
 use super::model::TrainedModel;
 use super::{TrainConfig, Trainer};
-use crate::base::hash::{self, Hasher};
-use crate::base::input;
-use crate::base::output::write_whole_with;
 use crate::gpu::{Gpu, SliceMut};
 use crate::kernels::lamp::{LAMP_NUMBERS, LAMP_WIDTH};
 use crate::networks::TensorFile;
-use crate::photographs::dataset::Fingerprint;
 use crate::splats::batches::Batches;
 use crate::splats::optimizer::{AdamBuffers, Moments};
 use crate::splats::scene::{Gaussians, Shape, width};

@@ -10,24 +10,25 @@ use std::ops::Bound;
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
+use nightsplat_core::camera::frame::{FRAME_EXTENT, TrainingFrame};
+use nightsplat_core::random::Stream;
+use nightsplat_core::settings;
+use nightsplat_core::settings::Rule;
+use nightsplat_photographs::dataset::{
+    DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize, PixelOrientation,
+};
+use nightsplat_photographs::image::StoredLight;
+use nightsplat_photographs::tone::ToneSettings;
+use nightsplat_photographs::white_balance::WhiteBalance;
 use serde::{Deserialize, Serialize};
 
 use super::cache::CacheSize;
 use super::parts::ModelConfig;
 use super::precision::PrecisionConfig;
 use super::streams;
-use crate::base::random::Stream;
-use crate::base::settings::{Rule, settings};
-use crate::camera::frame::{FRAME_EXTENT, TrainingFrame};
 use crate::gpu::Tile;
 use crate::loss::{LossConfig, ParameterWeights};
 use crate::networks::NetworkVariant;
-use crate::photographs::dataset::{
-    DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize, PixelOrientation,
-};
-use crate::photographs::image::StoredLight;
-use crate::photographs::tone::ToneSettings;
-use crate::photographs::white_balance::WhiteBalance;
 use crate::splats::attributes::Attribute;
 use crate::splats::densify::DensityControl;
 use crate::splats::lamp::Lamp;
@@ -37,7 +38,6 @@ use crate::splats::render::RenderSettings;
 use crate::splats::scene::init::Initialization;
 use crate::splats::scene::{MAX_SH_DEGREE, ModelFacts, Shape};
 use crate::{Error, Result};
-
 pub use antialiasing::AntialiasingConfig;
 pub use exposure::ExposureConfig;
 pub use freeze::Freeze;
@@ -73,6 +73,15 @@ impl std::str::FromStr for Background {
 settings! {
 ""
 /// A training run. The defaults are those of the preset `balanced`: the best score per second.
+///
+/// ```
+/// use nightsplat::{Tone, ToneSettings, TrainConfig};
+///
+/// let curve: Tone = "ase".parse()?;
+/// let config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::default() };
+/// config.check()?;
+/// # Ok::<(), nightsplat::Error>(())
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrainConfig {
     /// The dataset's folder.
@@ -227,7 +236,7 @@ const WHITE_BALANCE: Rule =
 /// A pattern of photographs' names.
 const PATTERN: Rule = Rule::Text(
     "a pattern of file names, such as IMG_01*.jpg",
-    crate::photographs::dataset::exclude::is_pattern,
+    nightsplat_photographs::dataset::exclude::is_pattern,
 );
 
 const MINUTES: Rule = Rule::from_to(0.0, 1e9);
@@ -274,7 +283,7 @@ impl DensityConfig {
     }
 
     /// The values of LITA-GS.
-    #[cfg(feature = "testing")]
+    #[doc(hidden)]
     pub fn paper() -> Self {
         Self {
             control: DensityControl::Paper,
@@ -383,8 +392,8 @@ impl TrainConfig {
     }
 
     /// The settings of the rasteriser.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn render_settings(&self) -> RenderSettings {
+    #[doc(hidden)]
+    pub fn render_settings(&self) -> RenderSettings {
         RenderSettings {
             shape: Shape { sh_degree: self.sh_degree, features: self.model.features() },
             raw_colors: self.model.raw_colors,

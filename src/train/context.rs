@@ -1,11 +1,11 @@
 //! The Gaussians that a training starts from: those that it trains, and around a block those that it renders alone.
 
+use nightsplat_core::camera::Camera;
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::dataset::block::{Block, Cell};
 use rayon::prelude::*;
 
 use super::TrainConfig;
-use crate::camera::Camera;
-use crate::photographs::dataset::Dataset;
-use crate::photographs::dataset::block::{Block, Cell};
 use crate::splats::joined::{MANIFEST, TileManifest};
 use crate::splats::scene::Gaussians;
 use crate::{Error, Result};

@@ -5,16 +5,16 @@
 //! expected depth rendered there. The moments of all Gaussians are reset.
 
 use glam::{DVec2, DVec3, Vec3};
+use nightsplat_core::camera::{Camera, Patch};
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::image::Image;
 
 use super::model::TrainedModel;
 use super::patches::put_together;
 use super::views::TrainView;
 use super::{Trainer, streams};
 use crate::Result;
-use crate::base::random::Stream;
-use crate::camera::{Camera, Patch};
 use crate::loss::exposure::{Affine, Exposures};
-use crate::photographs::image::Image;
 use crate::splats::attributes::{AttributePlane, planes};
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
@@ -228,8 +228,8 @@ mod tests {
     use glam::DAffine3;
 
     use super::*;
-    use crate::camera::CameraModel;
     use crate::splats::scene::{Features, Shape};
+    use nightsplat_core::camera::CameraModel;
 
     fn camera(width: u32, height: u32) -> Camera {
         let (focal, principal_point) = (DVec2::splat(2.0), DVec2::new(1.0, 0.5));

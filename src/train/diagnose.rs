@@ -13,7 +13,6 @@ mod lamp;
 mod noise;
 mod photograph;
 mod plan;
-#[cfg(feature = "cli")]
 mod remarks;
 mod sharpness;
 mod target_noise;
@@ -22,18 +21,18 @@ use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
+use nightsplat_core::camera::Camera;
+use nightsplat_photographs::dataset::{self, Borders, Dataset, LoadOptions, Split, View};
+use nightsplat_photographs::findings::{brought_near_white, findings};
+use nightsplat_photographs::image::{
+    ColourCounts, Image, ImageFile, Levels, MIDDLE_GREY, Mask, PictureFile, decoded_at_once, files,
+};
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tone::{Exposure, MeasuredPhotograph, ToneSettings, is_black};
+use nightsplat_photographs::white_balance::WhiteBalanceMatrix;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::camera::Camera;
-use crate::photographs::dataset::{self, Borders, Dataset, LoadOptions, Split, View};
-use crate::photographs::findings::{brought_near_white, findings};
-use crate::photographs::image::{
-    ColourCounts, Image, Levels, MIDDLE_GREY, Mask, PictureFile, files,
-};
-use crate::photographs::targets::SceneTone;
-use crate::photographs::tone::{Exposure, MeasuredPhotograph, ToneSettings, is_black};
-use crate::photographs::white_balance::WhiteBalanceMatrix;
 use crate::{Error, Result};
 use geometry::SceneGeometry;
 pub(super) use geometry::exposures_at_points;
@@ -42,7 +41,6 @@ use lamp::{LampObservations, bands};
 pub use noise::ChannelNoise;
 use photograph::PhotographStatistics;
 pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
-#[cfg(feature = "cli")]
 pub(crate) use remarks::remarks_at_points;
 pub use target_noise::TargetNoise;
 
@@ -306,7 +304,7 @@ fn read(
         true => Borders::default(),
     };
     let mut photographs = vec![];
-    for files in files.chunks(Image::decoded_at_once(largest)) {
+    for files in files.chunks(decoded_at_once(largest)) {
         let read = files.par_iter().map(|file| {
             let name = file.name.clone();
             let load = || PhotographStatistics::load(file, options, &borders, balance, &colours);
@@ -431,7 +429,7 @@ fn target_noise(
     exposure: &Exposure,
     shared: &SceneGeometry,
 ) -> f64 {
-    let encoded = f64::from(crate::photographs::image::srgb_from_linear(light as f32));
+    let encoded = f64::from(nightsplat_photographs::image::srgb_from_linear(light as f32));
     let weight = exposure.weight();
     // The curve's slope at the photograph's mean; 1 without a curve.
     let soft = |x: f64| exposure.ends.soft(x, exposure.gain);
@@ -518,10 +516,10 @@ fn remarks(
 mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
-    use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
-    use crate::photographs::image::openings;
-    use crate::photographs::tone::{Tone, ToneCurve};
     use crate::train::{CacheSize, TrainConfig, Trainer};
+    use nightsplat_photographs::image::openings;
+    use nightsplat_photographs::tone::{Tone, ToneCurve};
+    use nightsplat_synth::SyntheticOptions;
 
     #[test]
     fn a_photograph_is_opened_once_before_the_first_step() {
@@ -533,7 +531,7 @@ mod tests {
             (2.0, ToneCurve::Ase.into()),
         ] {
             let folder = tempfile::tempdir().unwrap();
-            synthetic::write(folder.path(), &set).unwrap();
+            nightsplat_synth::write(folder.path(), &set).unwrap();
             let config = TrainConfig {
                 dataset: folder.path().to_owned(),
                 tone: ToneSettings::new(curve.clone()),

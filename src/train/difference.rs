@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use nightsplat_core::hash::{self, Hasher};
 use toml::Value;
 
 use super::TrainConfig;
 use super::layers::values;
 use crate::Result;
-use crate::base::hash::{self, Hasher};
 
 /// Settings that affect no result beyond rounding: the dataset's path, saving and logging, time limits, and values that
 /// a run determines itself.

@@ -6,6 +6,7 @@
 //! Scores fluctuate with the most recent views and with every round of density control. So they are never taken right
 //! after a round, and a run that has converged ends only after a cooldown.
 
+use nightsplat_photographs::dataset::{Dataset, Split};
 use serde::{Deserialize, Serialize};
 
 use super::best::Snapshot;
@@ -13,8 +14,7 @@ use super::decisions::{Decisions, HeldOutScore};
 use super::target_views::TargetViews;
 use super::{TrainConfig, Trainer};
 use crate::Result;
-use crate::photographs::dataset::{Dataset, Split};
-use crate::photographs::targets::Targets;
+use crate::targets::Targets;
 
 /// Steps after a round of density control in which the held-out views are not scored.
 const SETTLING_DISTANCE: u64 = 50;
@@ -97,15 +97,15 @@ impl Trainer {
     }
 
     /// Whether the run may end before its last step.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn may_end_early(&self) -> bool {
+    #[doc(hidden)]
+    pub fn may_end_early(&self) -> bool {
         let is_open = self.converged().is_none() && !self.convergence.decisions.goes_on;
         is_open && self.step < self.cooldown_begin() && !self.convergence.held_out.is_empty()
     }
 
     /// The step after which the cooldown begins: no density control, decaying learning rates.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn cooldown_begin(&self) -> u64 {
+    #[doc(hidden)]
+    pub fn cooldown_begin(&self) -> u64 {
         let planned = self.config.steps - self.config.effective_cooldown_steps();
         self.converged().map_or(planned, |converged| converged.min(planned))
     }
@@ -210,9 +210,9 @@ impl Trainer {
 mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
-    use crate::photographs::dataset::Dataset;
-    use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
     use crate::train::StopConfig;
+    use nightsplat_photographs::dataset::Dataset;
+    use nightsplat_synth::SyntheticOptions;
 
     #[test]
     fn a_run_ends_once_two_scores_in_a_row_gain_too_little() {
@@ -251,7 +251,7 @@ mod tests {
             seed: 3,
             ..SyntheticOptions::default()
         };
-        synthetic::write(folder.path(), &options).unwrap();
+        nightsplat_synth::write(folder.path(), &options).unwrap();
         let mut config = TrainConfig { steps: 20, ..TrainConfig::bare() };
         (config.stop.views, config.stop.margin) = (1, margin);
         config.schedule.resolution_steps = [0, 0];

@@ -1,9 +1,10 @@
 //! The tone mapping of a scene, as a lamp needs it: from linear light to the colours of a model.
 
+use nightsplat_photographs::image::{Image, linear_from_srgb};
+
 use crate::Result;
-use crate::photographs::image::{Image, linear_from_srgb};
-use crate::photographs::targets::Targets;
 use crate::splats::lamp::Lamp;
+use crate::targets::Targets;
 
 /// The tone curve of a lamp's colours; [`Lamp`] has its formula.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -3,8 +3,9 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use nightsplat_core::random::Stream;
+
 use super::streams;
-use crate::base::random::Stream;
 
 /// The orders of recent epochs, each drawn once.
 #[derive(Debug, Default)]

@@ -3,19 +3,20 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, Photograph, View};
+use nightsplat_photographs::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
+
 use super::diagnose::exposures_at_points;
 use super::views::Views;
 use super::{TrainConfig, Trainer};
 use crate::loss::exposure::{Affine, table};
-use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, View};
-use crate::photographs::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
-use crate::photographs::targets::Targets;
+use crate::targets::Targets;
 use crate::{Error, Result};
 
 impl Trainer {
     /// The exposure of each training view, by name; `None` if exposures are not learned.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn exposures(&self) -> Result<Option<Vec<(String, Affine)>>> {
+    #[doc(hidden)]
+    pub fn exposures(&self) -> Result<Option<Vec<(String, Affine)>>> {
         let Some(exposures) = &self.supervision.exposures else { return Ok(None) };
         let names = self.supervision.views.names().map(str::to_owned);
         Ok(Some(names.zip(exposures.affines()?).collect()))

@@ -5,19 +5,19 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use glam::{DVec3, Vec3};
+use nightsplat_core::camera::{Camera, Patch, TrainingFrame};
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::dataset::{Dataset, Point, View};
+use nightsplat_photographs::image::Image;
 
 use super::views::{ImageKind, TrainView, TrainingPhotograph, Views};
 use super::{TrainConfig, streams};
-use crate::base::random::Stream;
-use crate::camera::{Camera, Patch, TrainingFrame};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::NetworkVariant;
-use crate::photographs::dataset::{Dataset, Point, View};
-use crate::photographs::image::Image;
-use crate::photographs::pseudo_gt::PseudoGt;
 use crate::splats::lamp::Lamp;
 use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
+use crate::targets::pseudo_gt::PseudoGt;
 use crate::{Error, Result};
 
 impl Views {

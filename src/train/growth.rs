@@ -1,16 +1,16 @@
 //! Density control in a run: its steps, and the limits of growth.
 
 use glam::UVec2;
+use nightsplat_core::camera::Camera;
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::dataset::Dataset;
 
 use super::memory::MARGIN;
 use super::rendered::Rendered;
 use super::target_views::TargetViews;
 use super::{TrainConfig, Trainer, streams};
 use crate::Result;
-use crate::base::random::Stream;
-use crate::camera::Camera;
 use crate::gpu::Gpu;
-use crate::photographs::dataset::Dataset;
 use crate::splats::densify::{Densifier, DensifyReport, DensifySettings, DensityControl, Round};
 use crate::splats::render::RenderOptions;
 use crate::splats::scene::GaussianSlice;
@@ -145,10 +145,10 @@ mod tests {
 
     use super::*;
     use crate::gpu::testing::gpu;
-    use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
-    use crate::photographs::targets::Targets;
+    use crate::targets::Targets;
     use crate::train::Preset;
     use crate::train::target_views::TargetViews;
+    use nightsplat_synth::SyntheticOptions;
 
     /// The most dB that a round may cost the training views.
     const BOUND: f64 = 0.3;
@@ -203,7 +203,7 @@ mod tests {
                 seed,
                 ..SyntheticOptions::default()
             };
-            synthetic::write(folder.path(), &options).unwrap();
+            nightsplat_synth::write(folder.path(), &options).unwrap();
             let mut config = growth_config(Preset::Fast, folder.path(), seed);
             config.schedule.densify_interval = 50;
             let (step, lost) = worst(&config);

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use glam::DVec3;
+use nightsplat_photographs::dataset::{Dataset, Point, View};
 
 use super::LampRates;
 use super::encoding::LampToneLaw;
@@ -10,11 +11,10 @@ use super::{Optimizer, TrainConfig, Trainer};
 use crate::Result;
 use crate::gpu::{Gpu, Recorder, Slice, SliceMut};
 use crate::kernels::lamp::LAMP_WIDTH;
-use crate::photographs::dataset::{Dataset, Point, View};
-use crate::photographs::targets::Targets;
 use crate::splats::lamp::Lamp;
 use crate::splats::optimizer::{AdamBuffers, Learnable, Moments};
 use crate::splats::render::{DeviceLamp, Renderer};
+use crate::targets::Targets;
 
 /// The most points whose distances are measured.
 const MAX_POINTS: usize = 20_000;
@@ -95,8 +95,8 @@ impl Optimizer {
 
 impl Trainer {
     /// The lamp as learned so far, in units of the dataset's world; `None` without one.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn lamp(&self) -> Result<Option<Lamp>> {
+    #[doc(hidden)]
+    pub fn lamp(&self) -> Result<Option<Lamp>> {
         Ok(self.renderer.lamp()?.map(|lamp| lamp.scaled(1.0 / self.frame.scale)))
     }
 }

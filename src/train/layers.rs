@@ -7,14 +7,14 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::input;
+use nightsplat_core::settings::{Rule, Setting};
+use nightsplat_photographs::tone::{OF_CURVE, ToneCurve};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
 use super::TrainConfig;
 use super::settings::{SETTINGS, flat, number, setting, takes, unknown, value};
-use crate::base::input;
-use crate::base::settings::{Rule, Setting};
-use crate::photographs::tone::{OF_CURVE, ToneCurve};
 use crate::{Error, Result};
 
 /// The origin of a value.
@@ -127,7 +127,6 @@ impl SettingsLayer {
     }
 
     /// Its keys with their values.
-    #[cfg(feature = "cli")]
     pub(crate) fn entries(&self) -> impl Iterator<Item = (&str, &Value)> {
         self.0.iter().map(|(key, value, _)| (key.as_str(), value))
     }
@@ -349,8 +348,8 @@ fn line_of(text: &str, key: &str) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::photographs::tone::ToneSettings;
     use crate::train::Background;
+    use nightsplat_photographs::tone::ToneSettings;
 
     fn with(assignments: &[&str]) -> Result<TrainConfig> {
         let assignments: Vec<String> = assignments.iter().map(|&text| text.to_owned()).collect();

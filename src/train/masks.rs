@@ -2,13 +2,13 @@
 //! gradient there, neither for the Gaussians nor for the statistics of density control.
 
 use glam::UVec2;
+use nightsplat_core::camera::Camera;
+use nightsplat_photographs::dataset::Dataset;
 
 use super::views::{TrainingView, Views};
 use crate::Result;
-use crate::camera::Camera;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{mask_gradient, mask_render};
-use crate::photographs::dataset::Dataset;
 use crate::splats::scene::COLOR_CHANNELS;
 
 /// The masks of the views and the kernels that apply them; a view without a mask costs nothing.

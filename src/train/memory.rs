@@ -4,12 +4,12 @@
 //! Gaussians in every run, resumed or not.
 
 use glam::UVec2;
+use nightsplat_core::camera::Patch;
 use serde::Serialize;
 
 use super::views::TrainView;
 use super::{CacheSize, Trainer};
 use crate::Result;
-use crate::camera::Patch;
 use crate::splats::render::RenderOptions;
 use crate::splats::scene::{Layout, Shape};
 

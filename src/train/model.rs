@@ -13,7 +13,7 @@ use crate::splats::scene::{DeviceGaussians, GaussianSlice, Gaussians, Layout, Sh
 
 impl Trainer {
     /// The gradients of all parameters in the last step, in the frame.
-    #[cfg(feature = "testing")]
+    #[doc(hidden)]
     pub fn gradients(&self) -> Result<Gaussians> {
         let TrainedModel { gaussians, gradients, .. } = &self.model;
         let parameters = self.model.trained_planes(&self.gpu).read(&self.gpu, gradients)?;
@@ -22,7 +22,7 @@ impl Trainer {
     }
 
     /// The floats of a plane set of gradients or moments.
-    #[cfg(feature = "testing")]
+    #[doc(hidden)]
     pub fn trained_floats(&self) -> usize {
         self.model.gradients.len()
     }

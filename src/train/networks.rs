@@ -3,12 +3,12 @@
 use std::path::Path;
 
 use glam::UVec2;
+use nightsplat_photographs::image::Image;
 
 use super::ModelConfig;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::networks::crop::{CropKernels, PaddedCrop};
 use crate::networks::{self, Denoiser, Parameters, Tonemapper};
-use crate::photographs::image::Image;
 use crate::splats::scene::{COLOR_CHANNELS, Feature, Features};
 use crate::{Error, Result};
 

@@ -4,8 +4,9 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use glam::UVec2;
+use nightsplat_core::settings;
+use nightsplat_core::settings::Rule;
 
-use crate::base::settings::{Rule, settings};
 use crate::loss::{DepthBoxes, Weights};
 use crate::networks::{Denoiser, DenoiserSettings, NetworkVariant, Tonemapper};
 use crate::splats::scene::Features;
@@ -53,9 +54,8 @@ impl Part {
         [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth, Self::Lamp];
 
     /// The parts of LITA-GS.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) const LITA: [Self; 4] =
-        [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth];
+    #[doc(hidden)]
+    pub const LITA: [Self; 4] = [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth];
 
     /// The name on the command line.
     pub fn name(self) -> &'static str {
@@ -182,8 +182,8 @@ impl ModelConfig {
 
     /// Sets LITA-GS's constants of the parts: size, random initialisation and learning rate of the networks, and the
     /// denoiser's total variation.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn follow_paper(&mut self) {
+    #[doc(hidden)]
+    pub fn follow_paper(&mut self) {
         let precision = self.network.precision;
         self.network = DenoiserSettings { precision, ..DenoiserSettings::paper() };
         self.rates = NetworkRates::paper();
@@ -191,8 +191,8 @@ impl ModelConfig {
     }
 
     /// Enables exactly these parts.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn set_parts(&mut self, parts: &[Part]) {
+    #[doc(hidden)]
+    pub fn set_parts(&mut self, parts: &[Part]) {
         self.denoiser = parts.contains(&Part::Denoiser);
         self.tonemapper = parts.contains(&Part::Tonemapper);
         self.structure = parts.contains(&Part::Structure);

@@ -1,11 +1,12 @@
 //! The kernels of a step.
 
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::dataset::Dataset;
+
 use super::{Background, TrainConfig, growth, streams};
 use crate::Result;
-use crate::base::random::Stream;
 use crate::gpu::Gpu;
 use crate::loss::Losses;
-use crate::photographs::dataset::Dataset;
 use crate::splats::batches::GradientKind;
 use crate::splats::densify::Densifier;
 use crate::splats::optimizer::{Adam, FiniteCheck};

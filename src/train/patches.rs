@@ -6,16 +6,16 @@
 use std::ops::RangeInclusive;
 
 use glam::UVec2;
+use nightsplat_core::camera::{Camera, Patch};
+use nightsplat_photographs::image::Image;
 
 use super::config::MIN_PATCH;
 use super::memory::MARGIN;
 use super::views::{ImageKind, TrainView, TrainingPhotograph, Views};
 use super::{TrainConfig, Trainer};
-use crate::camera::{Camera, Patch};
 use crate::gpu::Gpu;
 use crate::networks::{Denoiser, Tonemapper};
-use crate::photographs::image::Image;
-use crate::photographs::pseudo_gt::PseudoGt;
+use crate::targets::pseudo_gt::PseudoGt;
 use crate::{Error, Result};
 
 impl TrainConfig {
@@ -133,9 +133,9 @@ mod tests {
     use glam::{DAffine3, DVec2};
 
     use super::*;
-    use crate::camera::CameraModel;
     use crate::gpu::testing::{gpu, not_run};
     use crate::train::Part;
+    use nightsplat_core::camera::CameraModel;
 
     fn camera(width: u32, height: u32) -> Camera {
         let size = DVec2::new(width.into(), height.into());

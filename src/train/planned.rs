@@ -2,13 +2,13 @@
 
 use std::path::Path;
 
+use nightsplat_photographs::dataset::{Dataset, LoadOptions};
 use toml::Value;
 
 use super::diagnose::{Diagnosis, Plan};
 use super::layers::{Origin, Settings, SettingsLayer};
 use super::{Preset, TrainConfig, Trainer};
 use crate::gpu::Gpu;
-use crate::photographs::dataset::{Dataset, LoadOptions};
 use crate::{Error, Result};
 
 /// Requested settings of a run in addition to its plan, from the lowest precedence to the highest.
@@ -152,8 +152,8 @@ impl Preset {
 impl Trainer {
     /// A trainer on the dataset in a folder, with settings in the format of config.toml; a diagnosis of the photographs
     /// decides the rest.
-    #[cfg(feature = "capi")]
-    pub(crate) fn with_settings(gpu: &Gpu, dataset: &str, toml: &str) -> Result<Self> {
+    #[doc(hidden)]
+    pub fn with_settings(gpu: &Gpu, dataset: &str, toml: &str) -> Result<Self> {
         let file = SettingsLayer::of_toml(toml, &Origin::Default)?;
         let mut requested = RequestedSettings { file, ..RequestedSettings::default() };
         requested.options.push("dataset", dataset.into(), Origin::Option("dataset"))?;

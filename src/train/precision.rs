@@ -2,16 +2,17 @@
 
 use std::sync::Arc;
 
+use nightsplat_core::settings;
+use nightsplat_core::settings::Rule;
 use rayon::iter::{IndexedParallelIterator, ParallelIterator};
 use rayon::slice::ParallelSlice;
 use rustc_hash::{FxHashMap, FxHashSet};
 use serde::{Deserialize, Serialize};
 
 use crate::Result;
-use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu};
-use crate::photographs::pseudo_gt::EncodedPlanes;
 use crate::splats::packed_sh::StorageFormat;
+use crate::targets::pseudo_gt::EncodedPlanes;
 
 settings! {
 "precision."
@@ -155,10 +156,10 @@ fn different(values: &[f32], most: usize) -> Option<Vec<u32>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::base::random::Stream;
     use crate::gpu::testing::gpu;
-    use crate::photographs::pseudo_gt::PseudoGt;
-    use crate::photographs::tone::ToneSettings;
+    use crate::targets::pseudo_gt::PseudoGt;
+    use nightsplat_core::random::Stream;
+    use nightsplat_photographs::tone::ToneSettings;
 
     /// The restored values, and the bits they were stored in.
     fn kept(bits: PhotographBits, values: &[f32]) -> (Vec<f32>, u32) {

@@ -5,11 +5,11 @@
 use std::path::Path;
 use std::str::FromStr;
 
+use nightsplat_photographs::tone::{Tone, ToneCurve};
 use toml::Value;
 
 use super::TrainConfig;
 use super::layers::{Origin, SettingsLayer};
-use crate::photographs::tone::{Tone, ToneCurve};
 use crate::{Error, Result};
 
 /// A trade-off of time and quality, or a benchmark of the paper.
@@ -173,12 +173,12 @@ mod tests {
     use super::*;
     use crate::loss::Weights;
     use crate::networks::NetworkVariant;
-    use crate::photographs::tone::ToneSettings;
     use crate::splats::attributes::Attribute;
     use crate::splats::densify::DensityControl;
     use crate::splats::optimizer::Schedule;
     use crate::splats::scene::init::Initialization;
     use crate::train::{DensityConfig, ModelConfig};
+    use nightsplat_photographs::tone::ToneSettings;
 
     fn applied(preset: Preset, scene: &str, curve: impl Into<Tone>) -> TrainConfig {
         let tone = ToneSettings::new(curve);

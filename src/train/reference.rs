@@ -2,13 +2,13 @@
 
 use std::fmt::Write;
 
+use nightsplat_core::settings::Setting;
 use toml::Value;
 
 use super::layers::values;
 use super::settings::SETTINGS;
 use super::{Preset, TrainConfig};
 use crate::Result;
-use crate::base::settings::Setting;
 
 /// The text of docs/settings.md: every setting and every preset.
 pub fn reference() -> Result<String> {

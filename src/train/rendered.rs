@@ -1,9 +1,10 @@
 //! The render of a view: colours, and the output of the networks.
 
+use nightsplat_core::camera::{Camera, Patch};
+use nightsplat_photographs::image::Image;
+
 use super::Networks;
 use crate::Result;
-use crate::camera::{Camera, Patch};
-use crate::photographs::image::Image;
 use crate::splats::render::{RenderOptions, Renderer};
 use crate::splats::scene::{GaussianSlice, Layout};
 
@@ -21,8 +22,8 @@ pub struct Rendered {
 impl Rendered {
     /// Renders `gaussians` from `camera` and applies the networks; in patches if the view exceeds the device, with a
     /// denoiser's norms over each patch.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn new<'a>(
+    #[doc(hidden)]
+    pub fn new<'a>(
         renderer: &mut Renderer,
         gaussians: impl Into<GaussianSlice<'a>>,
         camera: &Camera,

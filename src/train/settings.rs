@@ -2,6 +2,9 @@
 
 use std::sync::LazyLock;
 
+use nightsplat_core::camera::TrainingFrame;
+use nightsplat_core::settings::{Rule, Setting};
+use nightsplat_photographs::tone::ToneSettings;
 use toml::{Table, Value};
 
 use super::{
@@ -9,12 +12,9 @@ use super::{
     ModelConfig, NetworkRates, PrecisionConfig, StopConfig, TrainConfig,
 };
 use crate::Error;
-use crate::base::settings::{Rule, Setting};
-use crate::camera::TrainingFrame;
 use crate::loss::exposure::ExposureRates;
 use crate::loss::{ParameterWeights, Weights};
 use crate::networks::DenoiserSettings;
-use crate::photographs::tone::ToneSettings;
 use crate::splats::optimizer::{LearningRates, Schedule};
 use crate::splats::scene::init::Initialization;
 

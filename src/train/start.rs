@@ -5,6 +5,8 @@ use std::path::Path;
 use std::thread::{self, ScopedJoinHandle};
 
 use glam::UVec2;
+use nightsplat_photographs::dataset::{Dataset, Fingerprint, Original};
+use nightsplat_photographs::scene_tone::SceneTone;
 
 use super::cache::CacheSize;
 use super::context::Initial;
@@ -23,10 +25,9 @@ use super::{Optimizer, TrainConfig, Trainer};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Exposures;
 use crate::loss::{LossLog, ParameterTerms};
-use crate::photographs::dataset::{Dataset, Fingerprint, Original};
-use crate::photographs::targets::{SceneTone, Targets};
 use crate::splats::densify::DensityControl;
 use crate::splats::scene::{FEATURES, Gaussians, Shape, ply};
+use crate::targets::Targets;
 use crate::{Error, Result};
 
 impl TrainConfig {

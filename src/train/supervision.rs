@@ -15,10 +15,10 @@ use crate::Result;
 use crate::gpu::{Buffer, Recorder};
 use crate::loss::exposure::Exposures;
 use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, TermInputs};
-use crate::photographs::targets::Targets;
 use crate::splats::optimizer::{Adam, Learnable};
 use crate::splats::render::Renderer;
 use crate::splats::scene::{COLOR_CHANNELS, Features};
+use crate::targets::Targets;
 
 /// The training views with their targets, and the terms of the loss.
 #[derive(Debug)]

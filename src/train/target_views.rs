@@ -1,20 +1,20 @@
 //! Views scored against their targets: held-out views, and probes among the training views.
 
 use glam::{DVec2, UVec2};
+use nightsplat_core::camera::{Camera, TrainingFrame};
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::image::{Image, Mask};
+use nightsplat_photographs::metrics::{Scores, psnr_of_counted};
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tone::{LuminanceHistogram, is_black};
 
 use super::Trainer;
+use super::rendered::Rendered;
 use super::terms::NetworkTerms;
 use super::views::{ImageKind, TrainingPhotograph};
 use crate::Result;
-use crate::camera::{Camera, TrainingFrame};
 use crate::loss::exposure::{Affine, Exposures};
-use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::image::{Image, Mask};
-use crate::photographs::metrics::{Scores, psnr_of_counted};
-use crate::photographs::targets::{SceneTone, Targets};
-use crate::photographs::tone::{LuminanceHistogram, is_black};
-
-use super::rendered::Rendered;
+use crate::targets::Targets;
 
 /// Views with their targets.
 #[derive(Debug, Default)]
@@ -163,15 +163,15 @@ fn clamped(image: &Image) -> Image {
 
 impl Trainer {
     /// The curves of the photographs.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn scene(&self) -> &SceneTone {
+    #[doc(hidden)]
+    pub fn scene(&self) -> &SceneTone {
         &self.supervision.targets.scene
     }
 
     /// The mean PSNR, dB, of the Gaussians' colours on the held-out views against their targets; `None` without
     /// held-out views.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn held_out_psnr(&mut self) -> Result<Option<f64>> {
+    #[doc(hidden)]
+    pub fn held_out_psnr(&mut self) -> Result<Option<f64>> {
         self.held_out_psnr_of_degree(self.sh_degree(self.step))
     }
 

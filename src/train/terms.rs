@@ -1,11 +1,11 @@
 //! The networks in a training step: crop of the render, forward, loss terms, backward.
 
 use glam::UVec2;
+use nightsplat_core::random::Stream;
 
 use super::masks::Masking;
 use super::networks::Networks;
 use super::{ModelConfig, TrainConfig, streams};
-use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ssim_window::RADIUS;
 use crate::loss::{

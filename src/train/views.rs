@@ -5,22 +5,23 @@ use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
 
 use glam::UVec2;
+use nightsplat_core::camera::Patch;
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::scene_tone::photographs;
 
 use super::TrainConfig;
 use super::cache::{Cache, CacheSize, CacheSlot};
 use super::epochs::Epochs;
 use super::precision::Encoder;
 use crate::Result;
-use crate::camera::Patch;
 use crate::gpu::{Buffer, Download, Recorder};
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
-use crate::photographs::dataset::Dataset;
-use crate::photographs::image::Image;
-use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::targets::{Targets, photographs};
 use crate::splats::render::{Viewpoint, Viewpoints};
 use crate::splats::scene::COLOR_CHANNELS;
+use crate::targets::Targets;
+use crate::targets::pseudo_gt::PseudoGt;
 
 /// A training view: a photograph, or a patch of a large one.
 #[derive(Debug)]

@@ -2,8 +2,8 @@
 
 use clap::Parser;
 use nightsplat::cli::tone::list::{ListArgs, text};
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::photographs::tone::FAMILIES;
+use nightsplat_photographs::tone::FAMILIES;
+use nightsplat_synth::SyntheticOptions;
 
 #[derive(Debug, Parser)]
 struct Command {
@@ -48,8 +48,11 @@ fn values_agree_with_the_formula() {
 fn curves_are_drawn_with_the_statistics_of_a_dataset() {
     let folder = tempfile::tempdir().unwrap();
     let set = folder.path().join("set");
-    synthetic::write(&set, &SyntheticOptions { width: 32, height: 24, ..Default::default() })
-        .unwrap();
+    nightsplat_synth::write(
+        &set,
+        &SyntheticOptions { width: 32, height: 24, ..Default::default() },
+    )
+    .unwrap();
     let csv = folder.path().join("mine.csv");
     std::fs::write(&csv, "0,0\n1,0.7\n2,1\n").unwrap();
     let svg = folder.path().join("curves.svg");

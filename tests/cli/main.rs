@@ -7,8 +7,8 @@ use std::sync::OnceLock;
 
 use nightsplat::kernels;
 use nightsplat::networks::lpips::Network;
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::metrics::Scores;
+use nightsplat_photographs::image::{Image, ImageFile};
+use nightsplat_photographs::metrics::Scores;
 use serde_json::Value;
 
 mod blocks;

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use nightsplat::photographs::image::Image;
+use nightsplat_photographs::image::{Image, ImageFile};
 use serde_json::Value;
 use tempfile::TempDir;
 

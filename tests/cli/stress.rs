@@ -11,7 +11,6 @@ use std::io::Write;
 use std::ops::Range;
 
 use glam::DVec2;
-use nightsplat::camera::{Camera, Patch};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{CheckReport, Gpu};
 use nightsplat::reference::blend_forward::blend_pixel;
@@ -21,6 +20,7 @@ use nightsplat::splats::render::RenderSettings;
 use nightsplat::splats::scene::{ATTRIBUTES, Gaussians};
 use nightsplat::train::{TrainConfig, Trainer};
 use nightsplat::{kernels, reference};
+use nightsplat_core::camera::{Camera, Patch};
 
 use cases::{CASES, Case, Effort, Expect};
 use hostile::Hostile;

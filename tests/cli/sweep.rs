@@ -218,7 +218,7 @@ fn the_offset_sweep_marks_the_adaptive_black_level() {
 #[test]
 fn tables_and_all_curves_are_grids() {
     let lines = |options: &str| Sweep::new(options).left();
-    let curves = nightsplat::photographs::tone::ToneCurve::ALL.len();
+    let curves = nightsplat_photographs::tone::ToneCurve::ALL.len();
     assert_eq!(lines("--curves all").len(), curves);
     assert_eq!(lines("--table leaderboard --seeds 1,2").len(), 2 * curves);
     assert_eq!(lines("--table offset").len(), 10);

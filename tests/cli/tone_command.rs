@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use clap::Parser as _;
 use nightsplat::cli::tone::apply::{ApplyArgs, ToneReport, apply};
-use nightsplat::photographs::image::{Image, srgb_from_linear};
-use nightsplat::photographs::metrics::psnr;
-use nightsplat::photographs::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat_photographs::image::{Image, ImageFile, srgb_from_linear};
+use nightsplat_photographs::metrics::psnr;
+use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
 
 #[derive(Debug, clap::Parser)]
 struct ToneApply {
@@ -205,12 +205,9 @@ fn scene_statistics_give_every_photograph_one_curve() {
 fn a_dataset_is_measured_on_training_views_and_scored_on_test_views() {
     let dir = tempfile::tempdir().unwrap();
     let set = dir.path().join("set");
-    let options = nightsplat::photographs::dataset::synthetic::SyntheticOptions {
-        width: 48,
-        height: 36,
-        ..Default::default()
-    };
-    nightsplat::photographs::dataset::synthetic::write(&set, &options).unwrap();
+    let options =
+        nightsplat_synth::SyntheticOptions { width: 48, height: 36, ..Default::default() };
+    nightsplat_synth::write(&set, &options).unwrap();
     let output = apply(&automatic(&set, "--curve ap3")).unwrap();
     assert!(output.scene.scores.is_some());
     let (test, training): (Vec<ToneReport>, Vec<ToneReport>) =

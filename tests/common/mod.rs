@@ -15,10 +15,10 @@ pub(crate) mod workspace;
 
 use std::path::{Path, PathBuf};
 
-use nightsplat::base::random::Stream;
 use nightsplat::gpu::Gpu;
 pub(crate) use nightsplat::gpu::testing::not_run;
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
+use nightsplat_core::random::Stream;
 
 /// A device that no other test uses, to count memory and passes.
 pub(crate) fn own_gpu() -> Gpu {

@@ -1,11 +1,9 @@
 //! Gaussians and a view of them, rendered by the shipped renderer.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, DVec4, UVec2, Vec2};
-use nightsplat::camera::{self, CameraModel, KannalaBrandt};
 use nightsplat::gpu::Tile;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::camera_pinhole::JACOBIAN_MARGIN;
-use nightsplat::photographs::tone::Profile;
 use nightsplat::reference::camera::fisheye::Fisheye;
 use nightsplat::reference::camera::pinhole::Pinhole;
 use nightsplat::reference::camera::{ReferenceCamera, ReferenceLens};
@@ -15,6 +13,8 @@ use nightsplat::splats::batches::Batches;
 use nightsplat::splats::lamp::Lamp;
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::{DeviceGaussians, Features, Gaussians, Shape};
+use nightsplat_core::camera::{self, CameraModel, KannalaBrandt};
+use nightsplat_photographs::tone::Profile;
 
 use super::Random;
 

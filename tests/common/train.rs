@@ -1,10 +1,10 @@
 //! Small datasets, and training on them.
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::Dataset;
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{StepReport, TrainConfig, Trainer};
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_synth::SyntheticOptions;
 
 /// A synthetic set of this many views of a size.
 pub(crate) fn small_set(views: usize, [width, height]: [u32; 2], seed: u64) -> SyntheticOptions {
@@ -14,7 +14,7 @@ pub(crate) fn small_set(views: usize, [width, height]: [u32; 2], seed: u64) -> S
 /// A dataset of this many synthetic views of a size, loaded with default options.
 pub(crate) fn dataset(views: usize, size: [u32; 2]) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
-    synthetic::write(folder.path(), &small_set(views, size, 1)).unwrap();
+    nightsplat_synth::write(folder.path(), &small_set(views, size, 1)).unwrap();
     Dataset::load(folder.path(), &TrainConfig::bare().load_options()).unwrap()
 }
 

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use nightsplat::photographs::dataset::synthetic;
+use nightsplat_synth;
 
 use super::train::small_set;
 
@@ -14,7 +14,7 @@ impl Workspace {
     pub(crate) fn new() -> Self {
         let workspace = Self(tempfile::tempdir().unwrap());
         let options = small_set(9, [40, 30], 2);
-        synthetic::write(workspace.path("set"), &options).unwrap();
+        nightsplat_synth::write(workspace.path("set"), &options).unwrap();
         workspace
     }
 

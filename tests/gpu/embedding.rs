@@ -8,8 +8,8 @@ use ash::vk::Handle as _;
 use ash::{khr, vk};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, HostDevice, HostFrame};
-use nightsplat::photographs::image::Image;
 use nightsplat::splats::render::{RenderSettings, Renderer};
+use nightsplat_photographs::image::Image;
 
 use crate::host::{Host, Memory};
 use crate::images::{OPTIONS, cameras, gaussians};

@@ -9,10 +9,10 @@ use nightsplat::Error;
 use nightsplat::gpu::testing::faults;
 use nightsplat::gpu::{DeviceChoice, Gpu};
 use nightsplat::networks::Denoiser;
-use nightsplat::photographs::dataset::Dataset;
 use nightsplat::results::run::{self, Event, IfExists, RunSummary};
 use nightsplat::splats::densify::DensityControl;
 use nightsplat::train::{MemoryEstimate, ModelConfig, Part, TrainConfig};
+use nightsplat_photographs::dataset::Dataset;
 
 use crate::common::train::dataset;
 

@@ -9,8 +9,6 @@ pub(crate) mod photograph;
 use ash::vk::Handle as _;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use half::f16;
-use nightsplat::base::random::Stream;
-use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{
     Gpu, HostFrame, HostImage, ImageFormat, ImageState, Reference as _, Threads,
@@ -22,6 +20,8 @@ use nightsplat::splats::render::{
     Target,
 };
 use nightsplat::splats::scene::{DeviceGaussians, Gaussians};
+use nightsplat_core::camera::{Camera, CameraModel};
+use nightsplat_core::random::Stream;
 
 use crate::common::{Random, not_run};
 use crate::host::{Host, Picture, usual_extensions, with_host};

@@ -38,6 +38,13 @@ pub(crate) fn files(folder: &str, extension: &str) -> Vec<(PathBuf, String)> {
     paths.into_iter().map(|path| (path.clone(), text(&path))).collect()
 }
 
+/// Every Rust file of the library: of the root package, and of the crates that it stands on or that stand on it.
+pub(crate) fn library() -> Vec<(PathBuf, String)> {
+    let mut crates = files("crates", "rs");
+    crates.retain(|(path, _)| path.iter().nth(2).is_some_and(|folder| folder == "src"));
+    [files("src", "rs"), crates].concat()
+}
+
 fn stem(path: &Path) -> &str {
     path.file_stem().unwrap().to_str().unwrap()
 }
@@ -69,16 +76,18 @@ fn the_list_of_layers_names_every_module_once() {
     let layers = layers(&lib);
     assert_eq!(layers.iter().copied().collect::<BTreeSet<_>>(), declared);
     assert_eq!(layers.len(), declared.len(), "a module is listed twice");
-    // For hosts each is private, except for the command.
-    let private = lib.lines().filter_map(|line| line.strip_prefix("mod ")?.strip_suffix(';'));
-    let hidden: BTreeSet<&str> = private.chain(["cli"]).collect();
-    assert_eq!(hidden, declared);
+    // Tests and the other crates use them, hosts do not.
+    let hidden = lib.lines().filter(|line| *line == "#[doc(hidden)]").count();
+    assert_eq!(hidden, declared.len(), "a module is part of the API");
 }
 
 #[test]
 fn a_folder_of_modules_lists_each_on_its_page() {
-    for folder in ["base", "photographs", "splats", "results"] {
-        let page = fs::read_to_string(Path::new(ROOT).join(format!("src/{folder}.rs"))).unwrap();
+    let crates = ["core", "photographs"].map(|name| format!("crates/{name}/src/lib.rs"));
+    for folder in
+        crates.into_iter().chain(["splats", "results"].map(|name| format!("src/{name}.rs")))
+    {
+        let page = fs::read_to_string(Path::new(ROOT).join(&folder)).unwrap();
         let declared =
             page.lines().filter_map(|line| line.strip_prefix("pub mod ")?.strip_suffix(';'));
         let listed: BTreeSet<&str> = layers(&page).into_iter().collect();
@@ -162,8 +171,11 @@ fn a_test_dispatches_a_kernel_by_hand_only_to_test_that_kernel() {
 
 #[test]
 fn unsafe_code_is_only_in_the_gpu_layer_and_the_c_interface() {
-    for (path, text) in files("src", "rs") {
-        if matches!(module(&path), "gpu" | "capi") {
+    for (path, text) in library() {
+        if path.starts_with("src/gpu")
+            || path == Path::new("src/gpu.rs")
+            || path.starts_with("crates/capi")
+        {
             continue;
         }
         for (number, line) in text.lines().enumerate() {
@@ -188,8 +200,33 @@ fn tests_start_the_command_and_look_for_captures_in_one_place() {
 }
 
 #[test]
+fn examples_use_the_api_alone() {
+    // What is no module of the API.
+    let api = ["config", "run", "synthetic", "ash", "glam"];
+    for (path, text) in files("examples", "rs") {
+        // An instrument of ours.
+        if path.ends_with("growth.rs") {
+            continue;
+        }
+        assert!(!text.contains("nightsplat_"), "{} uses a crate below", path.display());
+        for rest in text.split("nightsplat::").skip(1) {
+            let (name, after) =
+                rest.split_at(rest.find(|c: char| !c.is_alphanumeric() && c != '_').unwrap());
+            let is_module = name.starts_with(char::is_lowercase) && after.starts_with("::");
+            assert!(!is_module || api.contains(&name), "{} uses {name}", path.display());
+        }
+    }
+}
+
+#[test]
 fn a_file_can_be_read_in_one_sitting() {
-    let all = [("src", "rs"), ("tests", "rs"), ("shaders-glsl", "comp"), ("shaders-glsl", "glsl")];
+    let all = [
+        ("src", "rs"),
+        ("crates", "rs"),
+        ("tests", "rs"),
+        ("shaders-glsl", "comp"),
+        ("shaders-glsl", "glsl"),
+    ];
     for (path, text) in all.into_iter().flat_map(|(folder, extension)| files(folder, extension)) {
         let lines = text.lines().count();
         assert!(lines <= MAX_LINES, "{} has {lines} lines", path.display());
@@ -201,8 +238,12 @@ fn a_clock_that_jumps_changes_nothing_but_the_dates_of_event_files_and_which_fil
 {
     let clocks = ["SystemTime", "UNIX_EPOCH", ".modified()"];
     // A changed time stamp costs only a checksum of the pixels, or another look at a model.
-    let may_ask = ["src/base/tree.rs", "src/results/run/tail.rs", "src/results/run/tensorboard.rs"];
-    for (path, text) in files("src", "rs") {
+    let may_ask = [
+        "crates/photographs/src/tree.rs",
+        "src/results/run/tail.rs",
+        "src/results/run/tensorboard.rs",
+    ];
+    for (path, text) in library() {
         let asks =
             text.lines().map(code).any(|line| clocks.iter().any(|clock| line.contains(clock)));
         let may = may_ask.iter().any(|allowed| path.ends_with(allowed));

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use crate::architecture::{code, files};
+use crate::architecture::{code, library};
 
 /// A module, by its path from the crate's root.
 type Module = Vec<String>;
@@ -17,8 +17,9 @@ struct Source {
 }
 
 fn module_of(path: &Path) -> Module {
-    let path = path.strip_prefix("src").unwrap().with_extension("");
-    path.iter().map(|name| name.to_str().unwrap().to_owned()).collect()
+    let path = path.with_extension("");
+    let names = path.iter().map(|name| name.to_str().unwrap());
+    names.skip_while(|name| *name != "src").skip(1).map(str::to_owned).collect()
 }
 
 /// The paths of a use tree: `a::{b, c::D}` is `a::b` and `a::c::D`. Returns the text after the tree.
@@ -166,6 +167,12 @@ fn modules_that_use_each_other_are_found() {
 
 #[test]
 fn no_two_modules_use_each_other() {
-    let found = circles(&files("src", "rs"));
+    let mut by_crate = BTreeMap::<PathBuf, Vec<_>>::new();
+    // Unit tests in a file of their own use what they like.
+    for (path, text) in library().into_iter().filter(|(path, _)| !path.ends_with("tests.rs")) {
+        let before = path.iter().take_while(|name| *name != "src").collect();
+        by_crate.entry(before).or_default().push((path, text));
+    }
+    let found: Vec<_> = by_crate.values().flat_map(|files| circles(files)).collect();
     assert!(found.is_empty(), "{found:#?}");
 }

@@ -138,8 +138,9 @@ fn settings_in_the_guide_and_the_internals_exist() {
 
 #[test]
 fn files_and_tests_in_documents_exist() {
-    let folders = ["src/", "tests/", "scripts/", "examples/", "docs/", "shaders-glsl/", "build/"];
-    let sources = [files("src", "rs"), files("tests", "rs")].concat();
+    let folders =
+        ["src/", "crates/", "tests/", "scripts/", "examples/", "docs/", "shaders-glsl/", "build/"];
+    let sources = [files("src", "rs"), files("crates", "rs"), files("tests", "rs")].concat();
     for (path, page) in documents() {
         let words = prose(&page)
             .flat_map(|line| line.split('`').skip(1).step_by(2))

@@ -2,13 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::architecture::{code, files};
-
-/// Types that are defined twice.
-const DEFINED_TWICE: [&str; 1] = [
-    // With the feature `check` and without it.
-    "Recordable",
-];
+use crate::architecture::{code, files, library};
 
 /// Names that do not say of what, or in which order.
 const VAGUE: [&str; 2] = ["own", "place"];
@@ -42,19 +36,19 @@ fn is_vague(line: &str) -> bool {
 #[test]
 fn a_type_name_is_defined_once() {
     let mut defined = BTreeMap::<String, Vec<String>>::new();
-    for (path, text) in files("src", "rs") {
+    for (path, text) in library() {
         for name in text.lines().filter_map(defined_type) {
             defined.entry(name.to_owned()).or_default().push(path.display().to_string());
         }
     }
-    defined.retain(|name, paths| paths.len() > 1 && !DEFINED_TWICE.contains(&name.as_str()));
+    defined.retain(|_, paths| paths.len() > 1);
     assert!(defined.is_empty(), "name each for what it is: {defined:#?}");
 }
 
 #[test]
 fn no_constructor_is_called_of_and_no_value_own_or_place() {
     let shaders = ["comp", "glsl"].map(|extension| ("shaders-glsl", extension));
-    let rust = ["src", "build", "tests", "examples"].map(|folder| (folder, "rs"));
+    let rust = ["src", "crates", "build", "tests", "examples"].map(|folder| (folder, "rs"));
     let all = rust.into_iter().chain(shaders).flat_map(|(folder, kind)| files(folder, kind));
     let mut vague = vec![];
     for (path, text) in all {

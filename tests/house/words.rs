@@ -18,7 +18,7 @@ const BANNED_NAMES: &str = "\
     room tame";
 
 /// The one who stands in a room is the synthetic set.
-const ROOMS: &str = "photographs/dataset/synthetic";
+const ROOMS: &str = "crates/synth";
 
 /// Phrases that no comment, message or page has, in lower case.
 const BANNED_PHRASES: &str = "\
@@ -38,7 +38,7 @@ fn is_code(path: &Path) -> bool {
 
 /// Every source and page with its text: Rust, GLSL, scripts and documents.
 fn sources() -> Vec<(PathBuf, String)> {
-    let folders = ["src", "build", "tests", "examples"].map(|folder| (folder, "rs"));
+    let folders = ["src", "crates", "build", "tests", "examples"].map(|folder| (folder, "rs"));
     let others = [
         ("shaders-glsl", "comp"),
         ("shaders-glsl", "glsl"),

@@ -1,7 +1,6 @@
 //! The depth term.
 
 use glam::{UVec2, Vec2};
-use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, Threads};
 use nightsplat::kernels::{
@@ -9,6 +8,7 @@ use nightsplat::kernels::{
 };
 use nightsplat::loss::{DepthBoxes, DepthLoss, LossTerm as _, Term};
 use nightsplat::splats::scene::Features;
+use nightsplat_core::random::Stream;
 
 use super::{
     Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,

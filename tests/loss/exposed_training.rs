@@ -5,12 +5,12 @@ use std::path::Path;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::exposure::BIAS_SCALE;
 use nightsplat::loss::exposure::{Affine, table};
-use nightsplat::photographs::dataset::synthetic;
-use nightsplat::photographs::dataset::{Dataset, Split, View};
-use nightsplat::photographs::image::{linear_from_srgb, srgb_from_linear};
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::results::run::{self, IfExists};
 use nightsplat::train::{Part, TrainConfig, Trainer};
+use nightsplat_photographs::dataset::{Dataset, Split, View};
+use nightsplat_photographs::image::{linear_from_srgb, srgb_from_linear};
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat_synth;
 
 use crate::common::train::{advance, small_set};
 
@@ -20,7 +20,7 @@ const FACTORS: [f32; 4] = [1.0, 0.5, 0.25, 2.0];
 /// Synthetic views, each darkened or brightened, under one curve.
 fn varied(folder: &Path) -> (TrainConfig, Dataset) {
     let options = small_set(14, [40, 30], 3);
-    synthetic::write(folder, &options).unwrap();
+    nightsplat_synth::write(folder, &options).unwrap();
     let mut tone = ToneSettings::new(ToneCurve::Ase);
     tone.scene_statistics = true;
     let mut config = TrainConfig { steps: 300, sh_degree: 0, tone, ..TrainConfig::bare() };

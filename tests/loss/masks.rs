@@ -2,11 +2,11 @@
 
 use nightsplat::gpu::testing::gpu;
 use nightsplat::networks::{DenoiserSettings, NetworkVariant};
-use nightsplat::photographs::dataset::Dataset;
-use nightsplat::photographs::image::{Image, Mask};
-use nightsplat::photographs::metrics::{Scores, psnr_of_counted};
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::train::{Part, TrainConfig, Trainer};
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::image::{Image, Mask};
+use nightsplat_photographs::metrics::{Scores, psnr_of_counted};
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
 
 use crate::common::train::{advance, train};
 

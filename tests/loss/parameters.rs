@@ -1,6 +1,5 @@
 //! The terms on parameters.
 
-use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Buffer, Threads};
 use nightsplat::kernels::parameter_terms;
@@ -10,6 +9,7 @@ use nightsplat::splats::attributes::{Attribute, PlaneCounts, column_count};
 use nightsplat::splats::batches::Batches;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::{GaussianSlice, Layout};
+use nightsplat_core::random::Stream;
 
 use super::{assert_close, central_differences, log_step};
 

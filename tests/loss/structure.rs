@@ -5,8 +5,8 @@ use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::structure_l1;
 use nightsplat::loss::{LossTerm as _, StructureLoss, Term};
-use nightsplat::photographs::structure::StructureTarget;
 use nightsplat::splats::scene::Features;
+use nightsplat::targets::structure::StructureTarget;
 
 use super::{
     Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,

@@ -1,11 +1,11 @@
 //! Crops of a view: their positions, and copying them.
 
 use glam::UVec2;
-use nightsplat::base::random::Stream;
 use nightsplat::gpu::Reference;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::{crop_gather, crop_scatter};
 use nightsplat::networks::crop::{CropKernels, PaddedCrop};
+use nightsplat_core::random::Stream;
 
 #[test]
 fn a_crop_is_a_cell_of_the_view_and_its_margin_is_clipped_to_the_view() {

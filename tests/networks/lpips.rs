@@ -8,7 +8,7 @@ use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::*;
 use nightsplat::networks::lpips::{Lpips, LpipsVersion, Network, Range};
-use nightsplat::photographs::image::Image;
+use nightsplat_photographs::image::Image;
 
 use crate::common::lpips::{noise, write};
 use crate::common::{Random, not_run, safetensors};

@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use nightsplat::Error;
-use nightsplat::photographs::tone::{CurveChoice, Family, Table, Tone, ToneCurve, ToneSettings};
 use nightsplat::train::TrainConfig;
+use nightsplat_photographs::tone::{CurveChoice, Family, Table, Tone, ToneCurve, ToneSettings};
 
 /// A curve read from a file with this name and text.
 fn load(name: &str, text: &str) -> Result<ToneSettings, Error> {

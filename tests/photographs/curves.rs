@@ -6,8 +6,8 @@ use nightsplat::kernels::curves::{
     CURVE_ASE, CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_PROFILE, CURVE_TABLE,
 };
 use nightsplat::kernels::{ToneParameters, pseudo_gt};
-use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::tone::{FAMILIES, Family, Table, ToneCurve, ToneSettings, White};
+use nightsplat::targets::pseudo_gt::PseudoGt;
+use nightsplat_photographs::tone::{FAMILIES, Family, Table, ToneCurve, ToneSettings, White};
 
 /// The published values after the clamp, as printed.
 const T: [f64; 8] = [0.05, 0.10, 0.25, 0.50, 1.00, 1.50, 2.00, 3.00];
@@ -86,6 +86,21 @@ fn the_table_is_in_order_and_its_names_are_unique() {
         }
     }
     assert_eq!(VALUES.len(), 23);
+}
+
+#[test]
+fn a_row_has_the_number_of_its_function_in_the_kernel() {
+    let source = include_str!("../../shaders-glsl/include/curves.glsl");
+    let numbers = source.lines().filter_map(|line| {
+        let (name, number) = line.strip_prefix("const uint CURVE_")?.split_once('=')?;
+        Some((name.trim().to_lowercase(), number.trim().trim_end_matches(';').parse().unwrap()))
+    });
+    let numbers: Vec<(String, u32)> = numbers.collect();
+    for family in &FAMILIES {
+        let row = (family.name.replace('-', "_"), family.curve.constant());
+        assert!(numbers.contains(&row), "{row:?}");
+    }
+    assert_eq!(numbers.len(), FAMILIES.len() + 3, "table, auto and profile have no row");
 }
 
 #[test]

@@ -1,9 +1,9 @@
 //! The brightness of automatic targets: the rule against a slow one over pixels, and unusual datasets.
 
 use glam::{DAffine3, DVec2, DVec3};
-use nightsplat::camera::{Camera, CameraModel};
-use nightsplat::photographs::targets::SceneTone;
-use nightsplat::photographs::tone::{
+use nightsplat_core::camera::{Camera, CameraModel};
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tone::{
     CurveEnds, Exposure, LuminanceHistogram, MeasuredPhotograph, NEAR_WHITE, Statistics,
     ToneSettings, exposure_knots, soft,
 };

@@ -5,12 +5,12 @@ mod command;
 mod profile;
 
 use nightsplat::Error;
-use nightsplat::base::random::Stream;
-use nightsplat::photographs::fit::{
+use nightsplat_core::random::Stream;
+use nightsplat_fit::{
     Channels, CurveFit, FitOptions, FitScene, Pair, Weighting, cross_validate, fit, psnr,
 };
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::tone::{FAMILIES, Family, Statistics, ToneCurve, ToneSettings, White};
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::tone::{FAMILIES, Family, Statistics, ToneCurve, ToneSettings, White};
 
 /// A dark photograph of independent colours; brightness decreases exponentially, so that t reaches about 4, from a
 /// black level of `floor`.
@@ -343,7 +343,7 @@ fn scores_are_the_psnr_of_the_mapped_photograph() {
             data: dark.data.iter().map(|&x| family.curve.apply(x, &parameters)).collect(),
             ..dark
         };
-        let expected = nightsplat::photographs::metrics::psnr(&mapped, &clamped).unwrap();
+        let expected = nightsplat_photographs::metrics::psnr(&mapped, &clamped).unwrap();
         let found = psnr(&settings, &pair);
         assert!((found - expected).abs() < 0.01, "{}: {found} dB, not {expected}", family.name);
     }

@@ -23,9 +23,10 @@ mod turned;
 use std::path::Path;
 
 use glam::{DQuat, DVec2, DVec3};
-use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split, View};
-use nightsplat::photographs::image::Image;
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split, View};
+use nightsplat_photographs::image::{Image, ImageFile};
 use serde_json::{Value, json};
+
 use synthetic::*;
 
 fn load(root: &Path) -> Dataset {

@@ -7,7 +7,7 @@ use std::fs;
 use std::panic::catch_unwind;
 use std::path::Path;
 
-use nightsplat::base::random::Stream;
+use nightsplat_core::random::Stream;
 
 #[path = "../../fuzz/parsers.rs"]
 mod parsers;

@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};
-use nightsplat::photographs::dataset::{Dataset, LoadOptions};
-use nightsplat::photographs::image::{Image, linear_from_srgb};
+use nightsplat_photographs::dataset::{Dataset, LoadOptions};
+use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb};
+use nightsplat_synth::{Capture, SyntheticOptions};
 
 use crate::common::command::{refused, run};
 
@@ -19,7 +19,7 @@ fn street() -> SyntheticOptions {
 
 fn written(options: &SyntheticOptions, capture: &Capture) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    synthetic::write_captured(folder.path(), options, capture).unwrap();
+    nightsplat_synth::write_captured(folder.path(), options, capture).unwrap();
     folder
 }
 
@@ -73,7 +73,11 @@ fn a_lit_test_view_is_what_its_photograph_would_be_without_darkening_and_noise()
         let [low, lit] =
             ["low", "lit"].map(|of| green(&image(dark.path(), &format!("{of}/{view}.png"))));
         let [low, lit] = [low, lit].map(|light| light.iter().sum::<f64>());
-        assert!((lit / low / synthetic::DARKENING - 1.0).abs() < 0.1, "{view}: {}", lit / low);
+        assert!(
+            (lit / low / nightsplat_synth::DARKENING - 1.0).abs() < 0.1,
+            "{view}: {}",
+            lit / low
+        );
     }
 }
 

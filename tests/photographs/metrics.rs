@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::process::Command;
 
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::metrics::{Scores, psnr, psnr_channel_mean, ssim};
+use nightsplat_photographs::image::{Image, ImageFile};
+use nightsplat_photographs::metrics::{Scores, psnr, psnr_channel_mean, ssim};
 
 use crate::common::{not_run, shared};
 

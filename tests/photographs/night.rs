@@ -1,9 +1,7 @@
 //! Night captures of the synthetic scenes: what a scene has at night, and what a camera does wrong there.
 
-use nightsplat::photographs::dataset::synthetic::{
-    self, CameraFaults, Capture, DARKENING, Night, SyntheticOptions,
-};
-use nightsplat::photographs::image::{Image, linear_from_srgb};
+use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb};
+use nightsplat_synth::{self, CameraFaults, Capture, DARKENING, Night, SyntheticOptions};
 
 use crate::common::command::{refused, run};
 use crate::common::fixture;
@@ -18,7 +16,7 @@ fn photographed(street: bool, night: Night, capture: &Capture) -> [Vec<Image>; 2
     let (views, width, height, seed) = (VIEWS, WIDTH, HEIGHT, 4);
     let options = SyntheticOptions { views, width, height, seed, night, ..usual };
     let folder = tempfile::tempdir().unwrap();
-    synthetic::write_captured(folder.path(), &options, capture).unwrap();
+    nightsplat_synth::write_captured(folder.path(), &options, capture).unwrap();
     let image = |of, view| Image::load(folder.path().join(format!("{of}/{view:03}.png"))).unwrap();
     ["low", "high"].map(|of| (0..VIEWS).map(|view| image(of, view)).collect())
 }
@@ -208,7 +206,7 @@ fn a_plain_set_keeps_its_bits() {
     let folder = tempfile::tempdir().unwrap();
     let (views, width, height) = (3, 32, 24);
     let plain = SyntheticOptions { views, width, height, seed: 5, ..Default::default() };
-    synthetic::write(folder.path(), &plain).unwrap();
+    nightsplat_synth::write(folder.path(), &plain).unwrap();
     for name in ["low/000.png", "low/001.png", "low/002.png", "high/000.png", "high/002.png"] {
         let [now, before] = [folder.path().to_owned(), fixture("lom")]
             .map(|set| Image::load(set.join(name)).unwrap());

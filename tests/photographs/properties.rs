@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use glam::{DAffine3, DMat2, DQuat, DVec2, DVec3, EulerRot};
-use nightsplat::camera::{Camera, CameraModel, Distortion, TrainingFrame};
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::{Dataset, LoadOptions};
-use nightsplat::photographs::tone::{FAMILIES, Table, ToneSettings};
 use nightsplat::splats::scene::{Gaussians, ply};
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
 use nightsplat::train::TrainConfig;
+use nightsplat_core::camera::{Camera, CameraModel, Distortion, TrainingFrame};
+use nightsplat_photographs::dataset::{Dataset, LoadOptions};
+use nightsplat_photographs::tone::{FAMILIES, Table, ToneSettings};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 

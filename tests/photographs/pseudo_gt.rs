@@ -4,10 +4,10 @@ use nightsplat::Error;
 use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat::kernels::ToneParameters;
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::targets::SceneTone;
-use nightsplat::photographs::tone::{MeasuredPhotograph, ToneCurve, ToneMapping, ToneSettings};
+use nightsplat::targets::pseudo_gt::PseudoGt;
+use nightsplat_photographs::image::{Image, ImageFile};
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tone::{MeasuredPhotograph, ToneCurve, ToneMapping, ToneSettings};
 
 use crate::common::{assert_close, fixture, shared};
 

@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use nightsplat::photographs::dataset::synthetic::{self, DARKENING, SyntheticOptions};
-use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
-use nightsplat::photographs::image::{Image, linear_from_srgb};
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb};
+use nightsplat_synth::{DARKENING, SyntheticOptions};
 
 use crate::common::command::run;
 
@@ -15,7 +15,7 @@ fn written(plots: u32) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     let options =
         SyntheticOptions { width: 64, height: 48, seed: 3, ..SyntheticOptions::street(plots) };
-    synthetic::write(dir.path(), &options).unwrap();
+    nightsplat_synth::write(dir.path(), &options).unwrap();
     dir
 }
 

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use glam::{DVec2, DVec3};
-use nightsplat::camera::CameraModel;
-use nightsplat::photographs::dataset::synthetic::{self, DARKENING, Night, SyntheticOptions};
-use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
-use nightsplat::photographs::image::{Image, linear_from_srgb};
+use nightsplat_core::camera::CameraModel;
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb};
+use nightsplat_synth::{DARKENING, Night, SyntheticOptions};
 
 use crate::common::command::{refused, run};
 use crate::common::train::small_set;
@@ -43,7 +43,7 @@ fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
 
 fn written(options: &SyntheticOptions) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
-    synthetic::write(dir.path(), options).unwrap();
+    nightsplat_synth::write(dir.path(), options).unwrap();
     dir
 }
 
@@ -125,7 +125,7 @@ fn the_views_of_a_point_agree_on_its_colour() {
         .iter()
         .map(|view| Image::load(dir.path().join(format!("high/{}.png", view.name))).unwrap())
         .collect();
-    let spread = |point: &nightsplat::photographs::dataset::Point| {
+    let spread = |point: &nightsplat_photographs::dataset::Point| {
         let green = point.views.iter().map(|&view| {
             let pixel = dataset.views[view as usize].camera.project(point.position).unwrap();
             references[view as usize]
@@ -175,7 +175,7 @@ fn invalid_options_are_refused() {
         SyntheticOptions { street: Some(0), ..SMALL },
         SyntheticOptions { street: Some(4), fisheye: true, ..SMALL },
     ] {
-        assert!(synthetic::write(dir.path(), &options).is_err(), "{options:?}");
+        assert!(nightsplat_synth::write(dir.path(), &options).is_err(), "{options:?}");
     }
     assert!(files(dir.path()).is_empty());
 }
@@ -184,7 +184,8 @@ fn invalid_options_are_refused() {
 fn a_folder_that_cannot_be_created_is_named() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("taken"), "").unwrap();
-    let problem = synthetic::write(dir.path().join("taken"), &SMALL).unwrap_err().to_string();
+    let problem =
+        nightsplat_synth::write(dir.path().join("taken"), &SMALL).unwrap_err().to_string();
     assert!(problem.contains("taken"), "{problem}");
 }
 
@@ -192,7 +193,7 @@ fn a_folder_that_cannot_be_created_is_named() {
 fn every_eighth_view_is_a_test_view() {
     let dir = written(&small_set(17, [16, 16], 0));
     let dataset = Dataset::load(dir.path(), &LoadOptions::default()).unwrap();
-    let is_test = |(index, view): (usize, &nightsplat::photographs::dataset::View)| {
+    let is_test = |(index, view): (usize, &nightsplat_photographs::dataset::View)| {
         (view.split == Split::Test) == (index % 8 == 0)
     };
     assert!(dataset.views.iter().enumerate().all(is_test));

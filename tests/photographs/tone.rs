@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use nightsplat::Error;
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::tone::{
+use nightsplat_photographs::image::{Image, ImageFile};
+use nightsplat_photographs::tone::{
     GainChoice, Statistics, Tone, ToneCurve, ToneParameters, ToneSettings, percentiles,
 };
 

@@ -8,9 +8,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::synthetic;
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{Background, TrainConfig, Trainer};
+use nightsplat_synth;
 
 use crate::common::command::succeed;
 use crate::common::train::{advance, dataset, small_set};
@@ -133,7 +133,7 @@ fn tiny_run() -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let [set, run] = ["set", "run"].map(|name| folder.path().join(name));
     let options = small_set(8, [32, 24], 1);
-    synthetic::write(&set, &options).unwrap();
+    nightsplat_synth::write(&set, &options).unwrap();
     keep_first_points(&set.join("colmap_sparse/0/points3D.txt"), 2000);
     succeed(&format!(
         "train {} --out {} --plan none --model plain --curve ap3 --steps 60 --hash-every 20 --set tile=[16,8] \

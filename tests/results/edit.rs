@@ -3,13 +3,13 @@
 use std::fs;
 
 use glam::{DAffine3, DMat3, DQuat, DVec3, Vec3};
-use nightsplat::base::random::Stream;
-use nightsplat::camera::Camera;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::image::Image;
 use nightsplat::splats::model::Model;
 use nightsplat::splats::render::{RenderOptions, Renderer};
 use nightsplat::splats::scene::{Gaussians, ply};
+use nightsplat_core::camera::Camera;
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::image::Image;
 
 use crate::common::command::{refused, run, succeed};
 use crate::common::largest;

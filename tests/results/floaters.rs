@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::fs;
 
 use glam::{DMat4, DVec3, Vec3};
-use nightsplat::base::random::Stream;
 use nightsplat::splats::scene::{Gaussians, ply};
+use nightsplat_core::random::Stream;
 
 use crate::common::command::succeed;
 use crate::common::workspace::Workspace;

@@ -1,8 +1,8 @@
 //! Light out of a run: the photographs' light, linear files, another size, exposures that vary.
 
-use nightsplat::photographs::image::Image;
 use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::ply;
+use nightsplat_photographs::image::{Image, ImageFile};
 use serde_json::Value;
 
 use crate::common::command::{refused, run, succeed};

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use nightsplat::photographs::image::Image;
+use nightsplat_photographs::image::{Image, ImageFile};
 
 use crate::common::command::{refused, succeed};
 use crate::common::workspace::Workspace;

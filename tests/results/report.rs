@@ -1,10 +1,10 @@
 //! The page is self-contained, escapes all text and highlights the best values.
 
-use nightsplat::photographs::image::Image;
 use nightsplat::results::report::{
     Best, Chart, Column, Comparison, Distribution, Mark, NumberTable, Picture, Report, Series,
     TextTable, distributions,
 };
+use nightsplat_photographs::image::Image;
 
 fn column(name: &str, digits: usize, best: Best) -> Column {
     Column { name: name.into(), digits, best }

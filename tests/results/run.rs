@@ -4,8 +4,8 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use nightsplat::photographs::image::Image;
 use nightsplat::results::run::{load_progress, stopped_at};
+use nightsplat_photographs::image::{Image, ImageFile};
 use serde_json::Value;
 
 use crate::common::command::{command, refused, refused_with, run, succeed};

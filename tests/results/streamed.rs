@@ -5,12 +5,12 @@ use std::io::{Cursor, Write as _};
 use std::path::Path;
 
 use glam::DVec3;
-use nightsplat::base::random::Stream;
 use nightsplat::results::export::Provenance;
 use nightsplat::results::export::streamed::{self, Division, INDEX, TileLoader, Written};
 use nightsplat::splats::levels::level;
 use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::{Gaussians, ply};
+use nightsplat_core::random::Stream;
 use serde_json::Value;
 use zip::write::{SimpleFileOptions, ZipWriter};
 

@@ -1,13 +1,13 @@
 //! The two filters against aliasing: compensated opacities, and the smoothing floor.
 
 use glam::{DVec2, Vec3};
-use nightsplat::camera::Camera;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::splats::smoothing::SmoothingFloor;
 use nightsplat::train::{TrainConfig, Trainer};
+use nightsplat_core::camera::Camera;
 
 use crate::common::setup::{Setup, fisheye};
 use crate::common::train::{advance, dataset};

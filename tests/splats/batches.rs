@@ -1,14 +1,13 @@
 //! More Gaussians than one binding can hold: passes in batches, with the same bits.
 
 use glam::{DVec3, Vec3};
-
 use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_with};
-use nightsplat::photographs::dataset::Dataset;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::{Gaussians, Layout, Shape, width};
 use nightsplat::train::{TrainConfig, Trainer};
+use nightsplat_photographs::dataset::Dataset;
 
 use crate::common::not_run;
 use crate::common::setup::{Setup, features};

@@ -6,20 +6,20 @@ use std::path::Path;
 
 use glam::{DVec2, DVec3};
 use nightsplat::Error;
-use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::{Defect, gpu, gpu_with, is_checked, with_defect};
 use nightsplat::gpu::{CheckReport, Gpu};
 use nightsplat::networks::NetworkVariant;
-use nightsplat::photographs::dataset::Dataset;
-use nightsplat::photographs::dataset::synthetic;
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::tone::{Statistics, Tone, ToneCurve, ToneSettings};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::{Features, Shape};
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
+use nightsplat::targets::pseudo_gt::PseudoGt;
 use nightsplat::train::{Background, Part, TrainConfig, Trainer};
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::image::{Image, ImageFile};
+use nightsplat_photographs::tone::{Statistics, Tone, ToneCurve, ToneSettings};
+use nightsplat_synth;
 
 use crate::common::Random;
 use crate::common::setup::{Gradients, Setup, tile_of, variants};
@@ -29,7 +29,7 @@ use crate::common::train::small_set;
 fn dataset(config: &TrainConfig) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
     let options = small_set(6, [40, 30], 1);
-    synthetic::write(folder.path(), &options).unwrap();
+    nightsplat_synth::write(folder.path(), &options).unwrap();
     let depth = folder.path().join("depth");
     std::fs::create_dir(&depth).unwrap();
     let map = Image::from_fn(20, 15, |x, y| [1.0 - (y as f32 + 0.1 * x as f32) / 20.0; 3]);
@@ -391,7 +391,7 @@ fn the_command_checks_a_dataset_and_names_the_buffer_that_differs() {
     use clap::Parser as _;
     let folder = tempfile::tempdir().unwrap();
     let options = small_set(3, [24, 18], 1);
-    synthetic::write(folder.path(), &options).unwrap();
+    nightsplat_synth::write(folder.path(), &options).unwrap();
     let check = |path: &Path| {
         let arguments = ["nightsplat", "check", path.to_str().unwrap(), "--steps", "1", "--json"];
         nightsplat::cli::Cli::try_parse_from(arguments).unwrap().run()

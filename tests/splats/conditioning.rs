@@ -4,10 +4,8 @@
 use std::ops::Range;
 
 use glam::{DVec2, DVec3};
-use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
-use nightsplat::photographs::tone::{Statistics, percentiles};
 use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::gaussian::Gaussian;
@@ -15,6 +13,8 @@ use nightsplat::reference::rounding::UNIT;
 use nightsplat::reference::splat::Splat;
 use nightsplat::splats::attributes::{AttributePlane, PlaneCounts, planes};
 use nightsplat::splats::optimizer::{Adam, AdamBuffers, AdamStep, LearningRates, Moments};
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::tone::{Statistics, percentiles};
 
 use crate::common::setup::Setup;
 use crate::common::{Random, widen};

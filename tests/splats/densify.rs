@@ -4,7 +4,6 @@
 mod host;
 
 use glam::{DVec3, Quat, Vec3};
-use nightsplat::camera::Camera;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::splats::densify::{
     Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, Round,
@@ -13,6 +12,7 @@ use nightsplat::splats::optimizer::Moments;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::{DeviceGaussians, Layout};
+use nightsplat_core::camera::Camera;
 
 use host::{COLUMNS, CONSERVING, Host, LAST, SETTINGS, camera_at, room_for, shape};
 

@@ -3,12 +3,12 @@
 use std::f64::consts::FRAC_PI_2;
 
 use glam::{DAffine3, DVec2, DVec3, DVec4};
-use nightsplat::camera::{Camera, CameraModel, KannalaBrandt, Patch};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels;
 use nightsplat::reference::camera;
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::scene::Shape;
+use nightsplat_core::camera::{Camera, CameraModel, KannalaBrandt, Patch};
 
 use crate::common::chain::Chain;
 use crate::common::setup::{Rendered, Setup, features, fisheye};

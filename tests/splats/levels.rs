@@ -1,16 +1,16 @@
 //! Levels of detail: how many Gaussians they have, what they keep, and how little they change images.
 
 use glam::{DAffine3, DMat3, DQuat, DVec3, Quat, Vec3};
-use nightsplat::base::random::Stream;
-use nightsplat::camera::Camera;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::metrics::psnr;
 use nightsplat::reference::densify_scatter::{ChildGaussian as Split, half_of};
 use nightsplat::splats::levels::{Cells, coarser, level};
 use nightsplat::splats::model::Model;
 use nightsplat::splats::render::{RenderOptions, Renderer};
 use nightsplat::splats::scene::{Gaussians, rest_coefficients};
+use nightsplat_core::camera::Camera;
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::metrics::psnr;
 
 /// A cloud around the origin.
 fn cloud(count: usize, seed: u64) -> Gaussians {

@@ -5,7 +5,6 @@ use std::array;
 use std::collections::HashSet;
 
 use glam::{DVec2, DVec3, UVec2, Vec2, Vec3};
-use nightsplat::camera::Patch;
 use nightsplat::gpu::testing::{gpu, gpu_with};
 use nightsplat::gpu::{Threads, Tile};
 use nightsplat::kernels::status::STATUS_TILE_LIMIT;
@@ -15,6 +14,7 @@ use nightsplat::kernels::{
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::render::{RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::Shape;
+use nightsplat_core::camera::Patch;
 
 use crate::common::setup::{Setup, features};
 use crate::common::{Random, not_run};

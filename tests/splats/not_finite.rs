@@ -2,8 +2,8 @@
 
 use nightsplat::Error;
 use nightsplat::gpu::testing::{Defect, gpu, with_defect};
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::train::{NotFinite, TrainConfig, Trainer};
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
 
 use crate::common::setup::{Rendered, Setup};
 use crate::common::train::{advance, dataset};

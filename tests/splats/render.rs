@@ -4,7 +4,6 @@ use std::collections::HashSet;
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, DVec4, Vec2, Vec3};
-use nightsplat::camera::Camera;
 use nightsplat::gpu::Tile;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::ProjectedSplat;
@@ -16,6 +15,7 @@ use nightsplat::splats::lamp::Lamp;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::{Attribute, Features, Gaussians, Shape};
+use nightsplat_core::camera::Camera;
 
 use crate::common::chain::Chain;
 use crate::common::setup::{Rendered, Setup, features, lamp, tile_of};

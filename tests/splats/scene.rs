@@ -1,14 +1,14 @@
 //! Gaussians on the host: their table, their initialisation, their file.
 
 use glam::{DAffine3, DVec2, DVec3, Quat, Vec3};
-use nightsplat::camera::{Camera, CameraModel};
-use nightsplat::photographs::dataset::{Point, Split, View};
-use nightsplat::photographs::image::Image;
 use nightsplat::splats::attributes::planes;
 use nightsplat::splats::scene::init::Initialization;
 use nightsplat::splats::scene::{
     ATTRIBUTES, Features, Gaussians, SH_C0, Shape, init, ply, rest_coefficients, width,
 };
+use nightsplat_core::camera::{Camera, CameraModel};
+use nightsplat_photographs::dataset::{Point, Split, View};
+use nightsplat_photographs::image::Image;
 
 /// A camera at `position` that looks along +z.
 fn camera(position: DVec3) -> Camera {

@@ -2,15 +2,15 @@
 //! recorded configuration.
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::photographs::dataset::{Dataset, LoadOptions};
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::targets::{SceneTone, TargetExposure};
-use nightsplat::photographs::tone::{
+use nightsplat::targets::pseudo_gt::PseudoGt;
+use nightsplat::train::{TrainConfig, Trainer};
+use nightsplat_photographs::dataset::{Dataset, LoadOptions};
+use nightsplat_photographs::image::{Image, ImageFile};
+use nightsplat_photographs::scene_tone::{SceneTone, TargetExposure};
+use nightsplat_photographs::tone::{
     GainChoice, MeasuredPhotograph, Table, Tone, ToneCurve, ToneSettings,
 };
-use nightsplat::train::{TrainConfig, Trainer};
+use nightsplat_synth::SyntheticOptions;
 
 use crate::common::train::small_set;
 
@@ -140,7 +140,7 @@ fn unusual_datasets_have_a_defined_brightness_or_a_clear_error() {
 fn photographs_are_tone_mapped_before_they_are_downscaled() {
     let folder = tempfile::tempdir().unwrap();
     let options = small_set(5, [96, 72], 1);
-    synthetic::write(folder.path(), &options).unwrap();
+    nightsplat_synth::write(folder.path(), &options).unwrap();
     let load = || {
         let options = LoadOptions { downscale: 3.0, ..LoadOptions::default() };
         Dataset::load(folder.path(), &options).unwrap()
@@ -179,6 +179,6 @@ fn photographs_are_tone_mapped_before_they_are_downscaled() {
 /// The same dataset, as it was written.
 fn load_dark(options: &SyntheticOptions) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
-    synthetic::write(folder.path(), options).unwrap();
+    nightsplat_synth::write(folder.path(), options).unwrap();
     Dataset::load(folder.path(), &LoadOptions { downscale: 3.0, ..Default::default() }).unwrap()
 }

@@ -4,13 +4,13 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
-use nightsplat::base::random::Stream;
 use nightsplat::gpu::Gpu;
-use nightsplat::photographs::dataset::synthetic::{self, Capture, Night, SyntheticOptions};
-use nightsplat::photographs::dataset::{Dataset, DepthOptions, LoadOptions};
-use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use nightsplat::train::diagnose::{Diagnosis, Plan};
 use nightsplat::train::{Preset, TrainConfig, Trainer};
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::dataset::{Dataset, DepthOptions, LoadOptions};
+use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
+use nightsplat_synth::{Capture, Night, SyntheticOptions};
 
 use crate::common::command::{refused, run, succeed};
 
@@ -28,7 +28,7 @@ const MEMORY: u64 = 8 << 30;
 
 fn written(capture: &Capture) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    synthetic::write_captured(folder.path(), &SET, capture).unwrap();
+    nightsplat_synth::write_captured(folder.path(), &SET, capture).unwrap();
     folder
 }
 

@@ -4,11 +4,11 @@ use std::fs;
 
 use glam::DVec3;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::Dataset;
-use nightsplat::photographs::image::{Image, Mask};
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{DensityConfig, Part, TrainConfig, Trainer};
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::image::{Image, Mask};
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
 
 use crate::common::train::{advance, train};
 

@@ -3,10 +3,10 @@
 use std::fs;
 use std::path::Path;
 
-use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};
-use nightsplat::photographs::dataset::{Dataset, LoadOptions};
-use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use nightsplat::train::diagnose::Diagnosis;
+use nightsplat_photographs::dataset::{Dataset, LoadOptions};
+use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
+use nightsplat_synth::{Capture, SyntheticOptions};
 
 use crate::common::command::{run, succeed};
 
@@ -18,14 +18,14 @@ const SET: SyntheticOptions = SyntheticOptions {
     fisheye: false,
     street: None,
     lamp: None,
-    night: synthetic::Night::NONE,
+    night: nightsplat_synth::Night::NONE,
 };
 
 /// A dark set whose training photographs are changed by a function of photograph, column, row and linear light.
 fn changed(change: impl Fn(usize, [u32; 2], f64) -> f64) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let capture = Capture { darkening: 6.0, ..Capture::default() };
-    synthetic::write_captured(folder.path(), &SET, &capture).unwrap();
+    nightsplat_synth::write_captured(folder.path(), &SET, &capture).unwrap();
     let entries = fs::read_dir(folder.path().join("low")).unwrap();
     let mut paths: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
     paths.sort();

@@ -2,10 +2,10 @@
 
 use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::{gpu, gpu_with};
-use nightsplat::photographs::dataset::{Dataset, Split};
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{TrainConfig, Trainer};
+use nightsplat_photographs::dataset::{Dataset, Split};
 
 use crate::common::log::warnings;
 use crate::common::train::{advance, dataset, train};

@@ -5,15 +5,14 @@ use std::path::Path;
 
 use glam::DVec3;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::synthetic::{self, Capture, Night, SyntheticOptions};
-use nightsplat::photographs::dataset::{Dataset, View};
-use nightsplat::photographs::image::{Image, Mask};
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::results::eval::{
     self, MAX_RESIDUAL_TRANSMITTANCE, Metric, ModelRenderer, ResidualTransmittance,
 };
 use nightsplat::train::{Background, Part, TrainConfig, Trainer};
-
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::image::{Image, ImageFile, Mask};
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat_synth::{Capture, Night, SyntheticOptions};
 use serde_json::Value;
 
 use crate::common::command::{self, succeed};
@@ -36,7 +35,7 @@ fn dark_room() -> tempfile::TempDir {
     /// Pixels whose channel mean is below this become black.
     const DARK: f32 = 0.5;
     let folder = tempfile::tempdir().unwrap();
-    synthetic::write_captured(folder.path(), &SET, &Capture::clean()).unwrap();
+    nightsplat_synth::write_captured(folder.path(), &SET, &Capture::clean()).unwrap();
     for part in ["low", "high"] {
         for file in fs::read_dir(folder.path().join(part)).unwrap() {
             let path = file.unwrap().path();
@@ -112,7 +111,7 @@ fn a_dark_room_has_reported_holes_over_black_and_none_over_random_colours() {
 #[test]
 fn a_black_point_cloud_trains_as_well_as_a_grey_one() {
     let folder = tempfile::tempdir().unwrap();
-    synthetic::write(folder.path(), &SET).unwrap();
+    nightsplat_synth::write(folder.path(), &SET).unwrap();
     let config = TrainConfig { steps: 30, ..TrainConfig::bare() };
     let grey = train(&config, &load(folder.path())).1;
     rewrite_points(folder.path(), |_| true);

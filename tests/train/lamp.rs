@@ -4,20 +4,20 @@ use std::fs;
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, Vec3};
-use nightsplat::base::random::Stream;
-use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::photographs::dataset::{Dataset, Point, Split, View};
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::metrics::Scores;
-use nightsplat::photographs::targets::Targets;
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::lamp::Lamp;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::splats::scene::init::Initialization;
+use nightsplat::targets::Targets;
 use nightsplat::train::{Part, TrainConfig, Trainer};
+use nightsplat_core::camera::{Camera, CameraModel};
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::dataset::{Dataset, Point, Split, View};
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::metrics::Scores;
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat_synth::SyntheticOptions;
 use serde_json::Value;
 
 use crate::common::command::{refused, run, succeed};
@@ -187,7 +187,7 @@ fn a_lamp_that_is_not_there_does_not_hurt() {
     let folder = tempfile::tempdir().unwrap();
     let options =
         SyntheticOptions { views: 17, width: 80, height: 60, seed: 4, ..Default::default() };
-    synthetic::write(folder.path(), &options).unwrap();
+    nightsplat_synth::write(folder.path(), &options).unwrap();
     let score = |parts: &[Part]| {
         let mut config = TrainConfig { steps: 600, ..TrainConfig::bare() };
         config.tone.scene_statistics = true;
@@ -219,7 +219,7 @@ fn a_run_keeps_its_lamp_for_scores_and_for_a_flight_that_carries_it() {
     let [set, run] = ["set", "run"].map(|name| folder.path().join(name));
     let options =
         SyntheticOptions { views: 9, width: 40, height: 30, seed: 2, ..Default::default() };
-    synthetic::write(&set, &options).unwrap();
+    nightsplat_synth::write(&set, &options).unwrap();
     let [set_name, run_name] = [&set, &run].map(|path| path.display().to_string());
     succeed(&format!(
         "train {set_name} --parts lamp --steps 30 --out {run_name} --set lamp.ambient=0"
@@ -272,7 +272,7 @@ fn a_lamp_that_cannot_be_told_from_something_else_is_warned_of() {
     let folder = tempfile::tempdir().unwrap();
     let options =
         SyntheticOptions { views: 3, width: 40, height: 30, seed: 2, ..Default::default() };
-    synthetic::write(folder.path(), &options).unwrap();
+    nightsplat_synth::write(folder.path(), &options).unwrap();
     let (set, out) = (folder.path().display(), folder.path().join("run"));
     let out = out.display();
     let command = format!(

@@ -3,11 +3,11 @@
 use std::fs;
 use std::path::Path;
 
-use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};
-use nightsplat::photographs::dataset::{Dataset, LoadOptions};
-use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use nightsplat::train::TrainConfig;
 use nightsplat::train::diagnose::{Diagnosis, LampDiagnosis, Plan, SceneDiagnosis};
+use nightsplat_photographs::dataset::{Dataset, LoadOptions};
+use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
+use nightsplat_synth::{Capture, SyntheticOptions};
 
 use crate::common::command::succeed;
 
@@ -23,7 +23,7 @@ fn varying() -> Capture {
 
 fn written(options: &SyntheticOptions, capture: &Capture) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    synthetic::write_captured(folder.path(), options, capture).unwrap();
+    nightsplat_synth::write_captured(folder.path(), options, capture).unwrap();
     folder
 }
 

@@ -5,14 +5,14 @@ use std::path::Path;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::loss::Term;
 use nightsplat::networks::{DenoiserSettings, NetworkVariant};
-use nightsplat::photographs::dataset::Dataset;
-use nightsplat::photographs::dataset::synthetic;
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::attributes::{ATTRIBUTES, Attribute, AttributeSpec};
 use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{Part, Rendered, StepReport, TrainConfig, Trainer};
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::image::{Image, ImageFile};
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat_synth;
 
 use crate::common::command::{refused, succeed};
 use crate::common::train::{small_set, train};
@@ -20,7 +20,7 @@ use crate::common::train::{small_set, train};
 /// Six views of 40 x 30 pixels, with depth maps if requested.
 fn make_set(folder: &Path, with_depth: bool) {
     let options = small_set(6, [40, 30], 1);
-    synthetic::write(folder, &options).unwrap();
+    nightsplat_synth::write(folder, &options).unwrap();
     if with_depth {
         let depth = folder.join("depth");
         std::fs::create_dir(&depth).unwrap();

@@ -3,15 +3,14 @@
 use std::fs;
 
 use glam::DVec3;
-
-use nightsplat::camera::TrainingFrame;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::{Dataset, Split, View};
-use nightsplat::photographs::image::{Image, Mask};
-use nightsplat::photographs::metrics::Scores;
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer};
 use nightsplat::train::{Part, Rendered, TrainConfig, Trainer};
+use nightsplat_core::camera::TrainingFrame;
+use nightsplat_photographs::dataset::{Dataset, Split, View};
+use nightsplat_photographs::image::{Image, Mask};
+use nightsplat_photographs::metrics::Scores;
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
 
 use crate::common::command::{command, refused, succeed};
 use crate::common::setup::{Setup, features};

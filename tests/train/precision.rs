@@ -4,9 +4,9 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::Dataset;
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::train::{PhotographBits, PrecisionConfig, TrainConfig, Trainer};
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
 
 /// The device and the peak of its memory are shared: one test at a time.
 fn alone() -> MutexGuard<'static, ()> {

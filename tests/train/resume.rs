@@ -7,12 +7,12 @@ use std::time::Duration;
 
 use glam::Vec3;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::synthetic;
-use nightsplat::photographs::dataset::{Dataset, Split, View};
-use nightsplat::photographs::image::Image;
 use nightsplat::results::run::{self, Event, IfExists};
 use nightsplat::splats::scene::Attribute;
 use nightsplat::train::{Background, EndReason, Part, StepReport, TrainConfig, Trainer};
+use nightsplat_photographs::dataset::{Dataset, Split, View};
+use nightsplat_photographs::image::Image;
+use nightsplat_synth;
 use safetensors::SafeTensors;
 
 use crate::common::command::{command, refused, succeed};
@@ -22,7 +22,7 @@ use crate::common::workspace::log;
 /// A dataset of nine small views.
 fn make_set(folder: &Path) {
     let options = small_set(9, [40, 30], 2);
-    synthetic::write(folder, &options).unwrap();
+    nightsplat_synth::write(folder, &options).unwrap();
 }
 
 /// Density control runs after steps 10 and 20 of thirty.
@@ -84,7 +84,7 @@ fn growth_and_the_sh_degree_stop_if_held_out_views_gain_too_little_and_stay_so_a
     let folder = tempfile::tempdir().unwrap();
     // Enough views to hold one out.
     let options = small_set(12, [40, 30], 2);
-    synthetic::write(folder.path(), &options).unwrap();
+    nightsplat_synth::write(folder.path(), &options).unwrap();
     let gpu = gpu();
     let mut free = config(&[]);
     free.schedule.densify_interval = 3;
@@ -119,7 +119,7 @@ fn growth_and_the_sh_degree_stop_if_held_out_views_gain_too_little_and_stay_so_a
 /// A dataset with one held-out view, and a run on it that converges as early as possible: no gain is enough.
 fn early(folder: &Path) -> (Dataset, TrainConfig) {
     let options = small_set(12, [40, 30], 2);
-    synthetic::write(folder, &options).unwrap();
+    nightsplat_synth::write(folder, &options).unwrap();
     let mut config = config(&[]);
     config.steps = 60;
     config.schedule.resolution_steps = [0, 0];

@@ -4,19 +4,18 @@ use std::time::Duration;
 
 use glam::{DVec2, UVec2, Vec3};
 use nightsplat::Error;
-use nightsplat::photographs::dataset::{Dataset, Split};
-use nightsplat::results::eval::{self, After, Metric, ModelRenderer};
-use nightsplat::splats::densify::DensityControl;
-
 use nightsplat::gpu::testing::{gpu, gpu_with, recorded, submitted};
 use nightsplat::gpu::{DeviceChoice, Gpu};
-use nightsplat::photographs::image::Image;
-use nightsplat::photographs::metrics::Scores;
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::results::eval::{self, After, Metric, ModelRenderer};
+use nightsplat::splats::densify::DensityControl;
 use nightsplat::splats::model::Model;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::{Gaussians, Shape};
 use nightsplat::train::{Background, StepReport, TrainConfig, Trainer};
+use nightsplat_photographs::dataset::{Dataset, Split};
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::metrics::Scores;
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
 
 use crate::common::train::{advance, train};
 

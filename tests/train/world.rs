@@ -1,14 +1,14 @@
 //! The world's origin and unit make no difference to a model.
 
 use glam::{DAffine3, DVec3};
-use nightsplat::camera::TrainingFrame;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::Dataset;
 use nightsplat::results::eval::{self, After, Evaluation, Metric, ModelRenderer};
 use nightsplat::results::run::{self, IfExists};
 use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::ply;
 use nightsplat::train::{TrainConfig, Trainer};
+use nightsplat_core::camera::TrainingFrame;
+use nightsplat_photographs::dataset::Dataset;
 
 use crate::common::train::advance;
 

@@ -3,14 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DVec2, DVec3, Vec3};
+use nightsplat_core::camera::{Camera, CameraModel};
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::dataset::{Dataset, Point, Split, View};
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
 
 use crate::Result;
-use crate::base::random::Stream;
-use crate::camera::{Camera, CameraModel};
 use crate::gpu::{CheckReport, Gpu};
-use crate::photographs::dataset::{Dataset, Point, Split, View};
-use crate::photographs::image::Image;
-use crate::photographs::tone::{ToneCurve, ToneSettings};
 use crate::results::{models, run};
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer, Status};

@@ -3,15 +3,16 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::tone::{ToneCurve, ToneParameters, ToneSettings};
+
 use super::scene::{self, Trainers};
 use super::{Bench, Timing, median, total};
 use crate::Result;
-use crate::base::random::Stream;
 use crate::ceilings::Ceiling;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime};
-use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{ToneCurve, ToneParameters, ToneSettings};
 use crate::splats::sort::{Count, RadixSort};
+use crate::targets::pseudo_gt::PseudoGt;
 
 /// A kernel over all its passes of a step.
 #[derive(Clone, Copy, Debug)]

@@ -1,12 +1,12 @@
 //! `--tune`: times the rasteriser with every tile size that the device supports, and stores the fastest.
 
 use anyhow::Result;
+use nightsplat_core::camera::Camera;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use super::scene::BenchScene;
 use super::{Bench, finish, median, print, stages, table, total};
-use crate::camera::Camera;
 use crate::gpu::{Buffer, Resources, TUNE_VARIABLE, Tile, TunedTile};
 use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
 use crate::splats::scene::{DeviceGaussians, Features, Layout, MAX_SH_DEGREE};

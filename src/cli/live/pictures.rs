@@ -6,16 +6,16 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use hyper::body::Bytes;
+use nightsplat_core::camera::CameraModel;
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, MeasuredSize, View};
+use nightsplat_photographs::image::{Image, ImageFile};
+use nightsplat_photographs::tone::ToneCurve;
 
 use crate::Result;
-use crate::camera::CameraModel;
 use crate::cli::driver;
 use crate::gpu::Gpu;
-use crate::photographs::dataset::{Dataset, LoadOptions, MeasuredSize, View};
-use crate::photographs::image::Image;
-use crate::photographs::targets::Targets;
-use crate::photographs::tone::ToneCurve;
 use crate::results::export::page::{Bookmark, PageImage, moved};
+use crate::targets::Targets;
 use crate::train::TrainConfig;
 
 /// What an image shows.

@@ -17,13 +17,13 @@ use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper::{Method, Request, Response};
 use hyper_util::rt::{TokioIo, TokioTimer};
+use nightsplat_core::hash;
 use tokio::net::TcpStream;
 use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
 
 use super::listen::Listen;
 use super::site::{Answer, Site};
-use crate::base::hash;
 use crate::{Error, Result};
 
 /// The most connections at a time. One more takes the place of the first that has not shown the token within

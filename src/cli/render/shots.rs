@@ -1,11 +1,11 @@
 //! What `render` renders: the dataset's views, or the frames of a path.
 
 use glam::DVec3;
+use nightsplat_core::camera::{Camera, CameraModel, CameraPath, FramePath, PathOptions};
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::image::Orientation;
 
 use super::{PathChoice, RenderArgs};
-use crate::camera::{Camera, CameraModel, CameraPath, FramePath, PathOptions};
-use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::image::Orientation;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 

@@ -2,13 +2,13 @@
 
 use std::path::Path;
 
+use nightsplat_core::output::write_whole;
 use serde_json::{Map, Value, json};
 
 use super::rows::{SweepResults, SweepRow};
 use super::runner::FailedPoint;
 use super::table::{ColumnStatistic, KEYS, Quantity};
 use crate::Result;
-use crate::base::output::write_whole;
 use crate::results::report::{Chart, Mark, NumberTable, Report, Series};
 use crate::results::run::{Progress, energy_counters};
 

@@ -180,8 +180,8 @@ fn product(axes: &[SweepAxis]) -> Vec<Vec<(String, String)>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::photographs::tone::ToneCurve;
     use crate::train::TrainConfig;
+    use nightsplat_photographs::tone::ToneCurve;
 
     fn names(given: &[(&str, &str)], table: Option<Grid>) -> Vec<String> {
         let axes: Vec<SweepAxis> =

@@ -2,17 +2,18 @@
 
 use std::path::Path;
 
+use nightsplat_core::output::write_whole;
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::metrics::Scores;
+
 use super::point::{ADAPTIVE, OFFSET};
 use super::rows::{SweepResults, SweepRow};
 use super::run::Run;
 use super::runner::FailedPoint;
 use super::table::{ColumnStatistic, CsvColumn, Quantity};
 use crate::Result;
-use crate::base::output::write_whole;
 use crate::gpu::Gpu;
-use crate::photographs::dataset::Dataset;
-use crate::photographs::image::Image;
-use crate::photographs::metrics::Scores;
 use crate::results::eval::{AGAINST, WITH_REFERENCE};
 use crate::results::report::{
     Chart, Column, Comparison, Mark, NumberTable, Picture, Report, Series,

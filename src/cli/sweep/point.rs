@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
+use nightsplat_photographs::tone::ToneCurve;
+
 use super::options::pair;
-use crate::photographs::tone::ToneCurve;
 use crate::train::Part;
 use crate::{Error, Result};
 

@@ -4,14 +4,14 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use nightsplat_photographs::dataset::View;
+use nightsplat_photographs::image::Image;
 
 use super::point::{PRESET, SweepPoint};
 use super::scores;
 use crate::cli::quoted;
 use crate::cli::train::TrainArgs;
 use crate::gpu::Gpu;
-use crate::photographs::dataset::View;
-use crate::photographs::image::Image;
 use crate::results::eval::ModelRenderer;
 use crate::results::run;
 use crate::splats::model::Model;

@@ -13,9 +13,9 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use indicatif::ProgressBar;
+use nightsplat_core::output::own_file;
 
 use super::run::Run;
-use crate::base::output::own_file;
 use crate::cli::{child, signals, tell_on_stderr};
 use crate::results::run::Requests;
 use crate::{Error, Result, Stop};

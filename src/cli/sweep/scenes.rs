@@ -10,12 +10,12 @@
 use std::path::Path;
 
 use anyhow::Result;
+use nightsplat_core::csv;
+use nightsplat_core::output::{printable, write_whole};
 
 use super::SweepArgs;
 use super::rows::{SweepResults, SweepRow, number};
 use crate::Error;
-use crate::base::csv;
-use crate::base::output::{printable, write_whole};
 use crate::cli::{finish, tell};
 use crate::networks::lpips::LpipsVersion;
 

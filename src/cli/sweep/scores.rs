@@ -2,13 +2,13 @@
 
 use std::path::Path;
 
+use nightsplat_core::output::{own_file, write_whole};
+use nightsplat_photographs::dataset::View;
 use serde_json::{Value, json};
 
-use crate::base::output::{own_file, write_whole};
 use crate::cli::driver;
 use crate::gpu::Gpu;
 use crate::networks::lpips::{Lpips, Range};
-use crate::photographs::dataset::View;
 use crate::results::eval::{Evaluation, Extras, ScoreReference};
 use crate::results::finished_run::FinishedRun;
 use crate::{Error, Result};

@@ -1,8 +1,9 @@
 //! The table of a sweep: a row per point, columns of the numbers of its runs. The leaderboard and the costs are tables
 //! of different columns.
 
+use nightsplat_core::csv;
+
 use super::rows::{SweepResults, SweepRow, number};
-use crate::base::csv;
 use crate::networks::lpips::LpipsVersion;
 use crate::results::report::{Best, Column, NumberTable};
 

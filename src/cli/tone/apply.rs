@@ -6,25 +6,27 @@ mod photographs;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::output::{create_folder, one_line};
+use nightsplat_photographs::dataset::{Dataset, Split};
+use nightsplat_photographs::findings::findings;
+use nightsplat_photographs::image::{ColourCounts, Image, Mask, Orientation, PictureFile};
+use nightsplat_photographs::metrics::Scores;
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tone::{
+    CurveChoice, Exposure, MeasuredPhotograph, NEAR_WHITE, Statistics, Tone, ToneCurve,
+    ToneSettings, all_black,
+};
+use nightsplat_photographs::tree::check_writable;
 use serde::Serialize;
 
 use self::page::TonePage;
 use self::photographs::{InputPhotograph, listed};
-use crate::base::output::{check_writable, create_folder, one_line};
 use crate::cli::settings::{CurveOptions, Selection, SettingOptions};
 use crate::cli::{OutputFormat, driver, finish, print, progress_bar, table, word, words};
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::photographs::dataset::{Dataset, Split};
-use crate::photographs::findings::findings;
-use crate::photographs::image::{ColourCounts, Image, Mask, Orientation, PictureFile};
-use crate::photographs::metrics::Scores;
-use crate::photographs::targets::{SceneTone, Targets};
-use crate::photographs::tone::{
-    CurveChoice, Exposure, MeasuredPhotograph, NEAR_WHITE, Statistics, Tone, ToneCurve,
-    ToneSettings, all_black,
-};
 use crate::results::eval;
 use crate::results::report::Distribution;
+use crate::targets::Targets;
 use crate::train::diagnose::remarks_at_points;
 use crate::train::{RequestedSettings, TrainConfig};
 use crate::{Error, Result};
@@ -399,7 +401,7 @@ fn mapped(set: &mut CurveOnSet, listed: &InputPhotograph) -> Result<Mapped> {
         let file = PictureFile::open(path)?.reduced(|size| listed.decoded_size(size));
         let (image, _) = file.decode_counted(&set.colours[1])?;
         let is_plain = listed.split.is_none();
-        Ok(if is_plain { image.turned(Orientation::from_file(path)) } else { image })
+        Ok(if is_plain { Orientation::from_file(path).upright(image) } else { image })
     };
     let reference = listed.reference.as_ref().map(load).transpose()?;
     let (statistics, image, gain) =

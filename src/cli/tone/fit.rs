@@ -2,17 +2,18 @@
 
 use std::path::PathBuf;
 
-use rayon::prelude::*;
-use serde::Serialize;
-
-use crate::base::output::{check_writable, write_whole};
-use crate::cli::table::aligned;
-use crate::cli::{finish, print, word};
-use crate::photographs::fit::{
+use nightsplat_core::output::write_whole;
+use nightsplat_fit::{
     Channels, CurveFit, CurveScores, Estimate, FitOptions, FitScene, HeldOut, Pair, Weighting,
     cross_validate, fit,
 };
-use crate::photographs::tone::{FAMILIES, Family, ToneCurve};
+use nightsplat_photographs::tone::{FAMILIES, Family, ToneCurve};
+use nightsplat_photographs::tree::check_writable;
+use rayon::prelude::*;
+use serde::Serialize;
+
+use crate::cli::table::aligned;
+use crate::cli::{finish, print, word};
 use crate::{Error, Result};
 
 mod plot;

@@ -2,13 +2,14 @@
 
 use std::path::PathBuf;
 
-use crate::base::output::write_whole;
-use crate::cli::{finish, print, table, words};
-use crate::photographs::dataset::{Dataset, LoadOptions, Split};
-use crate::photographs::image::{ColourCounts, Image};
-use crate::photographs::tone::{
+use nightsplat_core::output::write_whole;
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat_photographs::image::{ColourCounts, Image, ImageFile};
+use nightsplat_photographs::tone::{
     CurveChoice, FAMILIES, Family, Statistics, Tone, ToneCurve, ToneSettings,
 };
+
+use crate::cli::{finish, print, table, words};
 use crate::results::report::{Chart, Series, VerticalLine};
 use crate::{Error, Result};
 

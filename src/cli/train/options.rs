@@ -3,12 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use nightsplat_photographs::dataset::exclude;
+use nightsplat_photographs::scene_tone::SceneTone;
 use toml::Value;
 
 use crate::cli::settings::{CurveOptions, Selection, SettingOptions, push_curve, push_dataset};
 use crate::cli::words::{self, NamedValues};
-use crate::photographs::dataset::exclude;
-use crate::photographs::targets::SceneTone;
 use crate::train::diagnose::Plan;
 use crate::train::{
     ModelName, Origin, Part, Preset, RequestedSettings, SettingsLayer, TrainConfig,

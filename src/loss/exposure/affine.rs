@@ -2,7 +2,8 @@
 
 use std::fmt;
 
-use crate::photographs::image::Image;
+use nightsplat_photographs::image::Image;
+
 use crate::{Error, Result};
 
 /// The exposure of a view: encoded values times gain plus bias, per channel.

@@ -10,11 +10,12 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
+use nightsplat_core::output::write_whole;
+use nightsplat_core::{csv, input};
+use nightsplat_photographs::image::files::stem;
+use nightsplat_photographs::image::{MIDDLE_GREY, linear_from_srgb, srgb_from_linear};
+
 use super::Affine;
-use crate::base::output::write_whole;
-use crate::base::{csv, input};
-use crate::photographs::image::files::stem;
-use crate::photographs::image::{MIDDLE_GREY, linear_from_srgb, srgb_from_linear};
 use crate::{Error, Result};
 
 /// The columns in the order in which they are written.

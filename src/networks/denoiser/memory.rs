@@ -38,7 +38,6 @@ pub(super) fn check(gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> Resul
 }
 
 /// The bytes that [`DenoiserMemory::new`] allocates.
-#[cfg(feature = "testing")]
 pub(super) fn bytes(settings: DenoiserSettings, extent: Extent) -> u64 {
     let images = settings.stages as usize + 3;
     let per_pixel = 2 * settings.channels() + images * RGB as usize;

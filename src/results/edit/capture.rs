@@ -4,21 +4,21 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use glam::DVec3;
+use nightsplat_core::camera::Camera;
+use nightsplat_core::input;
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::tone::ToneSettings;
 
 use super::placement::Placement;
-use crate::base::input;
-use crate::camera::Camera;
 use crate::gpu::Gpu;
-use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::image::Image;
-use crate::photographs::targets::Targets;
-use crate::photographs::tone::ToneSettings;
 use crate::results::eval::{After, Evaluation, Extras, Metric, ModelRenderer, ScoreReference};
 use crate::results::finished_run::{FinishedRun, Opener, is_model};
 use crate::results::run;
 use crate::splats::model::Model;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Gaussians, ModelFacts};
+use crate::targets::Targets;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 

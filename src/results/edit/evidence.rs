@@ -12,15 +12,15 @@
 //! (Hutchinson's estimator). Its gradient with respect to a white colour is the weight of a Gaussian in the view.
 
 use glam::Vec3;
+use nightsplat_core::camera::{Camera, Patch};
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::dataset::View;
+use nightsplat_photographs::image::Image;
 
 use super::capture::ModelPhotographs;
 use super::placement::Placement;
 use crate::Result;
-use crate::base::random::Stream;
-use crate::camera::{Camera, Patch};
 use crate::loss::exposure::Affine;
-use crate::photographs::dataset::View;
-use crate::photographs::image::Image;
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer, ViewGradients};
 use crate::splats::scene::{

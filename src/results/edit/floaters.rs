@@ -8,10 +8,10 @@
 //! not rendered any more, and the others are seen without what it added. All others come back.
 
 use glam::DVec3;
+use nightsplat_photographs::image::Image;
 
 use super::evidence::{Evidence, Measured};
 use crate::Result;
-use crate::photographs::image::Image;
 use crate::splats::scene::Gaussians;
 
 /// The most rounds in which opacities follow the error.

@@ -3,9 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use glam::{DQuat, DVec3};
+use nightsplat_core::{hash, input};
 use serde::{Deserialize, Serialize};
 
-use crate::base::{hash, input};
 use crate::splats::scene::{Gaussians, MAX_SH_DEGREE, Shape};
 use crate::{Error, Result};
 

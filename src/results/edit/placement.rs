@@ -1,8 +1,7 @@
 //! Where an edited model is in the world of its dataset.
 
 use glam::{DAffine3, DMat3, DQuat, DVec3};
-
-use crate::camera::{Camera, TrainingFrame};
+use nightsplat_core::camera::{Camera, TrainingFrame};
 
 /// A similarity: a point of the dataset's world is at `scale * rotation * point + translation` of the edited one.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -3,11 +3,11 @@
 use std::str::FromStr;
 
 use glam::{DQuat, DVec3, Vec3};
+use nightsplat_core::camera::Camera;
+use nightsplat_photographs::image::Image;
 
 use super::ModelRenderer;
-use crate::camera::Camera;
 use crate::gpu::Gpu;
-use crate::photographs::image::Image;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::{Feature, Features, Gaussians, SH_C0};
 use crate::train::Networks;

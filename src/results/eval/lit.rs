@@ -2,10 +2,11 @@
 
 use std::path::PathBuf;
 
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::image::{Image, ImageFile};
+
 use super::{After, Evaluation, ReferenceKind, aligned, quantized};
 use crate::Result;
-use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::image::Image;
 use crate::train::Rendered;
 
 /// The test views in the light of the lamp at the camera, bright and without noise, if a dataset has these.

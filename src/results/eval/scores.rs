@@ -1,11 +1,11 @@
 //! The scores of test views, a row each.
 
+use nightsplat_photographs::metrics::Scores;
+use nightsplat_photographs::tone::ToneSettings;
 use serde_json::{Map, Value, json};
 
 use super::ReferenceKind;
 use crate::networks::lpips::LpipsVersion;
-use crate::photographs::metrics::Scores;
-use crate::photographs::tone::ToneSettings;
 use crate::results::report::{Best, Column, NumberTable};
 
 /// What a score measures.

@@ -3,11 +3,11 @@
 //! Over a black background, a dark surface needs no Gaussians, and neither loss nor score tells a hole from a dark
 //! surface. The residual transmittance of the blend does: the product of 1 - alpha over all splats of a pixel.
 
+use nightsplat_photographs::dataset::{Dataset, View};
 use serde::Serialize;
 
 use super::{Evaluation, Metric};
 use crate::Result;
-use crate::photographs::dataset::{Dataset, View};
 use crate::train::{Background, Rendered};
 
 /// A view with a higher mean has a hole. No view of a model of a real scene exceeds 0.095 after 400 to 3 500 steps over
@@ -26,8 +26,7 @@ pub struct ResidualTransmittance {
 impl ResidualTransmittance {
     /// Residual transmittance of a render over the pixels that the view's mask keeps; `None` without any, or if the
     /// image is not a render.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn measure(rendered: &Rendered, view: &View) -> Option<Self> {
+    pub fn measure(rendered: &Rendered, view: &View) -> Option<Self> {
         let mut counted = rendered.transmittances.clone()?;
         if let Some(mask) = &view.mask {
             let mask = mask.resized(rendered.colors.width, rendered.colors.height);

@@ -4,11 +4,11 @@
 //! node.
 
 use glam::Vec3;
+use nightsplat_photographs::image::linear_from_srgb;
 use serde_json::{Map, Value, json};
 
 use super::{GENERATOR, Provenance, half_turn, sigmoid, unit};
 use crate::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
-use crate::photographs::image::linear_from_srgb;
 use crate::splats::scene::{Gaussians, SH_C0, rest_coefficients};
 use crate::{Error, Result};
 

@@ -6,14 +6,14 @@
 
 use glam::{DAffine3, DVec3};
 use half::f16;
+use nightsplat_core::camera::{Camera, CameraModel};
+use nightsplat_photographs::image::Image;
 use serde_json::json;
 
 use super::{GENERATOR, Provenance, gzip};
-use crate::camera::{Camera, CameraModel};
 use crate::kernels::camera_pinhole::JACOBIAN_MARGIN;
 use crate::kernels::lamp::{LAMP_FARTHEST, LAMP_KNEE, LAMP_LEFT, LAMP_NEAREST};
 use crate::kernels::splat::{ALPHA_MIN, DILATION};
-use crate::photographs::image::Image;
 use crate::results::report::{base64, escape, jpeg};
 use crate::splats::lamp::Lamp;
 use crate::splats::render::RenderSettings;
@@ -192,8 +192,8 @@ pub(crate) fn packed(gaussians: &Gaussians) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::camera::KannalaBrandt;
     use crate::results::export::tests::drawn;
+    use nightsplat_core::camera::KannalaBrandt;
 
     #[test]
     fn a_page_is_one_file_and_no_name_in_it_ends_a_script() {

@@ -10,6 +10,7 @@ use std::path::Path;
 use glam::Vec3;
 use image::codecs::webp::{WebPDecoder, WebPEncoder};
 use image::{ExtendedColorType, ImageDecoder, ImageError};
+use nightsplat_core::output::{create_folder, write_whole};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use zip::ZipArchive;
@@ -17,7 +18,6 @@ use zip::write::{SimpleFileOptions, ZipWriter};
 
 use super::palette::{codebook, nearest, vectors};
 use super::{GENERATOR, Provenance, raw_opacity, sigmoid, unit};
-use crate::base::output::{create_folder, write_whole};
 use crate::splats::scene::{Gaussians, MAX_SH_DEGREE, ModelFacts, rest_coefficients};
 use crate::{Error, Result};
 
@@ -422,8 +422,8 @@ fn of_rotation([a, b, c, largest]: [u8; 4]) -> [f32; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::photographs::tone::SceneLaw;
     use crate::results::export::tests::drawn;
+    use nightsplat_photographs::tone::SceneLaw;
 
     #[test]
     fn a_decoded_model_agrees_within_its_precision_and_has_the_stated_facts() {

@@ -309,8 +309,8 @@ fn smallest_three([w, x, y, z]: [f32; 4]) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::photographs::tone::SceneLaw;
     use crate::results::export::tests::drawn;
+    use nightsplat_photographs::tone::SceneLaw;
 
     fn encode_alone(model: &Gaussians, version: Version) -> Vec<u8> {
         encode(model, &Provenance::default(), version).unwrap()

@@ -16,11 +16,11 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DQuat, DVec3};
+use nightsplat_core::output::{create_folder, write_whole};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use super::{GENERATOR, Provenance, sog};
-use crate::base::output::{create_folder, write_whole};
 use crate::splats::levels::{self, Cells};
 use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::{Error, Result};

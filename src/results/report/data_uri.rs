@@ -1,7 +1,8 @@
 //! Images within a page: base64 (RFC 4648) in a data URI.
 
+use nightsplat_photographs::image::{Image, ImageFile};
+
 use crate::Result;
-use crate::photographs::image::Image;
 
 /// The image as an 8-bit PNG; an empty URI for an image without pixels.
 pub(super) fn png(image: &Image) -> String {

@@ -1,7 +1,8 @@
 //! Histograms of luminance: of a photograph, its target and the reference image.
 
+use nightsplat_photographs::tone::{luminance, measurable};
+
 use super::chart::{Chart, Series};
-use crate::photographs::tone::{luminance, measurable};
 
 /// Bins over [0, 1]; higher values count in the last.
 const BINS: usize = 64;

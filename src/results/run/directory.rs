@@ -26,6 +26,10 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::csv;
+use nightsplat_core::output::{flush_to_disk, own_file, write_whole};
+use nightsplat_photographs::dataset::{Dataset, Split, View};
+
 use super::backup::{self, Backup};
 use super::files::*;
 use super::generations;
@@ -33,12 +37,9 @@ use super::ledger;
 use super::lock::RunLock;
 pub use super::progress::Progress;
 use super::tensorboard::EventFile;
-use crate::base::csv;
-use crate::base::output::{flush_to_disk, own_file, write_whole};
 use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::loss::exposure::{Affine, table};
-use crate::photographs::dataset::{Dataset, Split, View};
 use crate::splats::scene::{Gaussians, ply};
 use crate::train::diagnose::Plan;
 use crate::train::{Networks, Settings, StepReport, TrainConfig, Trainer};
@@ -367,8 +368,8 @@ mod tests {
     use glam::DAffine3;
 
     use super::*;
-    use crate::camera::Camera;
     use crate::results::run::{load_config, load_gaussians, other_views};
+    use nightsplat_core::camera::Camera;
 
     fn create(path: &Path, config: &TrainConfig, overwrite: bool) -> Result<RunDirectory> {
         RunDirectory::check(path, overwrite)?;

@@ -3,12 +3,12 @@
 
 use std::path::Path;
 
+use nightsplat_core::output::{flush_to_disk, own_file, write_whole};
+use nightsplat_photographs::dataset::{Dataset, Fingerprint};
 use serde::{Deserialize, Serialize};
 
 use super::files::{DONE, FILES, trained_with};
-use crate::base::output::{flush_to_disk, own_file, write_whole};
 use crate::gpu::Gpu;
-use crate::photographs::dataset::{Dataset, Fingerprint};
 use crate::train::{Ended, TrainConfig};
 use crate::{Error, Result};
 

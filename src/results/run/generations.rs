@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::output::own_file;
+
 use super::files::{CHECKPOINT, CHECKPOINT_BEFORE, unwritable};
 use crate::Result;
-use crate::base::output::own_file;
 use crate::train::check_checkpoint;
 
 fn both(run: &Path) -> [PathBuf; 2] {

@@ -5,7 +5,8 @@
 //! 100,1482,3c0a...,...
 //! ```
 
-use crate::base::hash;
+use nightsplat_core::hash;
+
 use crate::splats::scene::{ATTRIBUTES, Gaussians};
 
 /// The table with a line for `step`. Lines of this and later steps are removed: a resumed run repeats them.

@@ -5,14 +5,15 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::{csv, input};
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::tone::CurveEnds;
+
 use super::directory::view_lines;
 use super::files::{EXPOSURES, LAMP, NETWORKS, PLAN, TARGET_EXPOSURE, VIEWS};
 use super::generations;
-use crate::base::{csv, input};
 use crate::gpu::Gpu;
 use crate::loss::exposure::{Affine, table};
-use crate::photographs::dataset::Dataset;
-use crate::photographs::tone::CurveEnds;
 use crate::splats::joined::TileManifest;
 use crate::splats::lamp::Lamp;
 use crate::splats::scene::{Features, Gaussians, ply};

@@ -17,19 +17,16 @@ pub struct Requests {
 
 impl Requests {
     /// Requests to save and stop.
-    #[cfg(feature = "cli")]
     pub fn stop(&self, cause: Stop) {
         self.stop.store(Self::code(cause), Ordering::Relaxed);
     }
 
     /// Requests to save and continue.
-    #[cfg(feature = "cli")]
     pub fn save(&self) {
         self.save.store(true, Ordering::Relaxed);
     }
 
     /// Requests to wait before the next steps, or no longer.
-    #[cfg(feature = "cli")]
     pub fn pause(&self, waits: bool) {
         self.pause.store(waits, Ordering::Relaxed);
     }
@@ -40,7 +37,6 @@ impl Requests {
     }
 
     /// Requests the model as it is, in an [`Event::Snapshot`](super::Event::Snapshot).
-    #[cfg(feature = "cli")]
     pub fn snapshot(&self) {
         self.snapshot.store(true, Ordering::Relaxed);
     }

@@ -5,12 +5,12 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use nightsplat_core::csv;
 use serde::Serialize;
 
 use super::files::{ENDED, HELD_OUT, LOG};
 use super::load::{is_finished, load_config, load_metrics};
 use super::lock::RunLock;
-use crate::base::csv;
 
 /// The state of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

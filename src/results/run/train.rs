@@ -3,13 +3,15 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::image::ImageFile as _;
+
 use super::directory::Progress;
 use super::files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE, TRAINED_WITH, trained_with};
 use super::meter::{ResourceMeter, ResourceUsage};
 use super::tensorboard::EventFile;
 use super::{Event, Requests, RunDirectory, RunSummary, done, generations, load};
 use crate::gpu::Gpu;
-use crate::photographs::dataset::{Dataset, View};
 use crate::results::eval::{self, After, Evaluation, Extras, Metric, ScoreReference, ScoredImages};
 use crate::splats::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::train::diagnose::Plan;

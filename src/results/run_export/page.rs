@@ -1,14 +1,13 @@
 //! The page of a run: its model with bookmarks of views.
 
 use glam::DVec3;
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::tone::ToneCurve;
 
 use super::{ExportOptions, has_networks};
 use crate::Result;
 use crate::gpu::Gpu;
-use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::image::Image;
-use crate::photographs::targets::Targets;
-use crate::photographs::tone::ToneCurve;
 use crate::results::edit::fingerprint;
 use crate::results::eval::ModelRenderer;
 use crate::results::export::Provenance;
@@ -17,6 +16,7 @@ use crate::results::finished_run::{FinishedRun, is_model};
 use crate::results::run;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::Gaussians;
+use crate::targets::Targets;
 use crate::train::TrainConfig;
 
 impl ExportOptions<'_> {
@@ -88,7 +88,7 @@ impl ExportOptions<'_> {
             }
             // A mirrored photograph is of a mirrored world, which the page shows as it is.
             let turned = |(label, image): (&str, Image)| {
-                let image = image.turned(view.orientation.turn());
+                let image = view.orientation.turn().upright(image);
                 (label.to_owned(), PageImage::Embedded(image))
             };
             Ok(Bookmark {

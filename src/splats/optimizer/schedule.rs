@@ -3,11 +3,12 @@
 use std::collections::BTreeMap;
 use std::ops::{Index, IndexMut};
 
+use nightsplat_core::settings;
+use nightsplat_core::settings::{Rule, Setting};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::Result;
-use crate::base::settings::{Rule, Setting, settings};
 use crate::kernels::sh::MAX_SH_DEGREE;
 use crate::splats::attributes::{ATTRIBUTES, Attribute};
 
@@ -17,8 +18,8 @@ pub struct LearningRates(pub [f64; ATTRIBUTES.len()]);
 
 impl LearningRates {
     /// The same rate for every attribute.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) const fn uniform(rate: f64) -> Self {
+    #[doc(hidden)]
+    pub const fn uniform(rate: f64) -> Self {
         Self([rate; ATTRIBUTES.len()])
     }
 
@@ -157,8 +158,8 @@ impl Schedule {
 
     /// The learning rates of `step` in a scene of `extent`: that of the means decays log-linearly, the others are
     /// constant.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn learning_rates(&self, step: u64, extent: f64) -> LearningRates {
+    #[doc(hidden)]
+    pub fn learning_rates(&self, step: u64, extent: f64) -> LearningRates {
         let mut rates = self.initial_rates;
         rates[Attribute::Means] = self.means_rate(step) * extent;
         let initial_rate_factor = self.rate_factor(step);
@@ -186,7 +187,6 @@ impl Schedule {
     /// What is left of the schedule after `step`, with `factor` steps for each of this schedule's. With fewer views, a
     /// Gaussian is in more of the steps. Adam divides by the root mean square of the gradients of all steps, also those
     /// that do not show it, and so moves it less in each: rates rise by the root of `factor`.
-    #[cfg(feature = "cli")]
     pub(crate) fn after_step(&self, step: u64, factor: f64) -> Self {
         let scaled = |steps: u64| (steps as f64 * factor).round() as u64;
         let left = |until: u64| scaled(until.saturating_sub(step));
@@ -212,8 +212,8 @@ impl Schedule {
     }
 
     /// The SH degree in use in `step`, at most `max`.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn sh_degree(&self, step: u64, max: u32) -> u32 {
+    #[doc(hidden)]
+    pub fn sh_degree(&self, step: u64, max: u32) -> u32 {
         let first = u64::from(self.first_sh_degree.unwrap_or_default());
         let degree = first.saturating_add(step / self.sh_degree_interval.max(1));
         degree.min(u64::from(max)) as u32

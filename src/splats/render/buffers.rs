@@ -301,7 +301,6 @@ mod tests {
     }
 
     /// Counted against allocations; the difference is padding to rows of sixteen bytes and to whole partitions.
-    #[cfg(feature = "io")]
     #[test]
     fn gaussians_and_intersections_take_the_bytes_that_are_foreseen() {
         let gpu = Gpu::new(&crate::gpu::DeviceChoice::Best).unwrap();

@@ -1,7 +1,8 @@
 //! Cameras on the device: kernels index a buffer of them.
 
+use nightsplat_core::camera::{Camera, Patch};
+
 use crate::Result;
-use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu};
 use crate::kernels;
 

@@ -1,10 +1,10 @@
 //! Capacity for Gaussians, views and intersections, and its memory.
 
 use glam::UVec2;
+use nightsplat_core::camera::Camera;
 
 use super::Renderer;
 use super::limits::max_tiles;
-use crate::camera::Camera;
 use crate::{Error, Result};
 
 impl Renderer {
@@ -25,8 +25,8 @@ impl Renderer {
     }
 
     /// The same for images of these sizes; where `gaussian_count` Gaussians need more memory, for `capacity` of them.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn reserve_sizes(
+    #[doc(hidden)]
+    pub fn reserve_sizes(
         &mut self,
         gaussian_count: usize,
         capacity: usize,
@@ -58,8 +58,8 @@ impl Renderer {
     }
 
     /// The most intersections of a view whose gradient records the device can bind at once.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn max_intersections(&self) -> u32 {
+    #[doc(hidden)]
+    pub fn max_intersections(&self) -> u32 {
         self.frame.max_intersections(&self.gpu)
     }
 
@@ -87,8 +87,8 @@ impl Renderer {
     }
 
     /// Sets the capacity to exactly `intersections`.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
+    #[doc(hidden)]
+    pub fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
         self.frame.set_intersection_capacity(&self.gpu, intersections)
     }
 
@@ -109,14 +109,14 @@ impl Renderer {
     }
 }
 
-#[cfg(all(test, feature = "io"))]
+#[cfg(all(test, feature = "train"))]
 mod tests {
     use glam::DAffine3;
 
-    use crate::camera::Camera;
     use crate::gpu::{DeviceChoice, Gpu};
     use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
     use crate::splats::scene::Gaussians;
+    use nightsplat_core::camera::Camera;
 
     /// With the sorts, whose memory is allocated with the first render.
     #[test]

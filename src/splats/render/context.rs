@@ -11,8 +11,8 @@ const INVISIBLE: f32 = -100.0;
 impl Renderer {
     /// Renders these Gaussians together with those of every view from now on. They have neither gradients nor
     /// statistics. SH degrees that the renderer does not have are dropped. Memory must be reserved anew.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn set_context(&mut self, context: &Gaussians) -> Result<()> {
+    #[doc(hidden)]
+    pub fn set_context(&mut self, context: &Gaussians) -> Result<()> {
         // The Gaussians of a view come after, at an aligned index.
         let missing = context.count.next_multiple_of(ALIGNMENT) - context.count;
         let mut padded = context.with_sh_degree(self.settings.shape.sh_degree);

@@ -1,9 +1,11 @@
 //! The depth of a view, to the host.
 
+use nightsplat_core::camera::{Camera, Patch};
+
 use super::{DepthChannel, ProjectionKind, RenderOptions, Renderer};
 use crate::Result;
-use crate::camera::{Camera, Patch};
 use crate::kernels::pack_pixels::NOTHING_SEEN;
+use crate::splats::camera::model_number;
 use crate::splats::scene::DeviceGaussians;
 
 /// The median depth, of everything in view.
@@ -20,7 +22,7 @@ impl Renderer {
     ) -> Result<Vec<f32>> {
         self.frame.set_channels(&self.gpu, self.settings.channels() + 1)?;
         self.reserve(gaussians.layout.count, [camera])?;
-        let camera_model = camera.model.number();
+        let camera_model = model_number(&camera.model);
         self.build_projections(ProjectionKind { camera_model, view_depths: true })?;
         self.build_blending(true)?;
         let whole = Patch::from(camera);

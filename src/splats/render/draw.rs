@@ -3,13 +3,15 @@
 //! Where a view has more intersections than memory, the nearest are drawn and the memory grows before a later draw, as
 //! soon as the frame that overflowed is done.
 
+use nightsplat_core::camera::{Camera, Patch};
+
 use super::target::Target;
 use super::{DepthChannel, ProjectionKind, RenderOptions, Renderer};
 use crate::Result;
-use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu, HostImage, ImageState, Pipeline, Recorder, Ring, Threads};
 use crate::kernels::status::STATUS_WORDS;
 use crate::kernels::{depth_limits, pack_pixels, photograph_light};
+use crate::splats::camera::model_number;
 use crate::splats::scene::{GaussianSlice, Layout};
 
 /// The outcome of the newest draw that is done.
@@ -138,7 +140,7 @@ impl Renderer {
         let size = |camera: &Camera| Patch::from(camera).size;
         self.reserve_sizes(layout.count, layout.capacity, cameras.iter().map(size))?;
         for camera in cameras {
-            let camera_model = camera.model.number();
+            let camera_model = model_number(&camera.model);
             let view_depths = target.needs_depths();
             self.build_projections(ProjectionKind { camera_model, view_depths })?;
         }
@@ -162,8 +164,8 @@ impl Renderer {
     }
 
     /// Takes memory for this many Gaussians, views of this size and this many intersections ahead of the first draw.
-    #[cfg(feature = "capi")]
-    pub(crate) fn reserve_draw(
+    #[doc(hidden)]
+    pub fn reserve_draw(
         &mut self,
         gaussian_count: usize,
         size: [u32; 2],

@@ -1,8 +1,9 @@
 //! Gradients of a view without a training: what each Gaussian adds to it.
 
+use nightsplat_core::camera::{Camera, Patch};
+
 use super::{Damping, Gradients, RenderOptions, Renderer};
 use crate::Result;
-use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu};
 use crate::splats::batches::Batches;
 use crate::splats::scene::{Attribute, DeviceGaussians, Gaussians};

@@ -1,17 +1,17 @@
 //! Renders to the host: the whole view if the device can, else patch by patch.
 
 use glam::UVec2;
+use nightsplat_core::camera::{Camera, Patch};
+use nightsplat_core::image::Image;
 
 use super::{DepthChannel, RenderOptions, RenderSettings, Renderer, Status};
 use crate::Result;
-use crate::camera::{Camera, Patch};
-use crate::photographs::image::Image;
 use crate::splats::scene::GaussianSlice;
 
 impl Renderer {
     /// The patches in which a view is rendered: the whole view where the device can, else patches that fit.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn patches(&self, camera: &Camera) -> Vec<Patch> {
+    #[doc(hidden)]
+    pub fn patches(&self, camera: &Camera) -> Vec<Patch> {
         self.patches_with_margin(camera, 0, |_| true)
     }
 
@@ -65,8 +65,8 @@ impl Renderer {
     }
 
     /// As [`Renderer::render_channels`], with the transmittance as the last channel, (channels + 1, H, W).
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn render_planes<'a>(
+    #[doc(hidden)]
+    pub fn render_planes<'a>(
         &mut self,
         gaussians: impl Into<GaussianSlice<'a>>,
         camera: &Camera,

@@ -97,20 +97,20 @@ impl LampBackward {
 
 impl Renderer {
     /// The lamp with its present numbers; `None`: evenly lit.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn lamp(&self) -> Result<Option<Lamp>> {
+    #[doc(hidden)]
+    pub fn lamp(&self) -> Result<Option<Lamp>> {
         let Some(lamp) = &self.lamp else { return Ok(None) };
         Ok(Some(Lamp::of_numbers(&self.gpu.read(&lamp.numbers)?)))
     }
 
     /// The gradient of the lamp's numbers in the last backward pass, (`LAMP_WIDTH`).
-    #[cfg(feature = "testing")]
+    #[doc(hidden)]
     pub fn lamp_gradients(&self) -> Option<&Buffer<f32>> {
         self.lamp.as_ref().map(|lamp| &lamp.gradients)
     }
 
     /// Replaces the numbers of the lamp on the device, (`LAMP_NUMBERS`).
-    #[cfg(feature = "testing")]
+    #[doc(hidden)]
     pub fn set_lamp_numbers(&mut self, numbers: &[f32]) -> Result<()> {
         let Some(lamp) = &mut self.lamp else { return Ok(()) };
         self.gpu.write(&mut lamp.numbers, numbers)

@@ -40,8 +40,8 @@ impl RenderSettings {
 
     /// The most Gaussians that this device can render and train: some passes read splat and colour of any Gaussian,
     /// which one binding has to hold. Other planes are bound in [`Batches`](crate::splats::batches::Batches).
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn peak_gaussians(&self, gpu: &Gpu) -> usize {
+    #[doc(hidden)]
+    pub fn peak_gaussians(&self, gpu: &Gpu) -> usize {
         let color = color_floats(self.channels()) * size_of::<f32>();
         let bytes = size_of::<ProjectedSplat>().max(color) as u64;
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
@@ -49,8 +49,8 @@ impl RenderSettings {
 
     /// The tile for views of these sizes: that of `RenderSettings::tile_up_to` the largest, or a multiple of its
     /// height where the settings name none and a view would have too many tiles.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn tile_for(
+    #[doc(hidden)]
+    pub fn tile_for(
         &self,
         gpu: &Gpu,
         sizes: impl Iterator<Item = [u32; 2]> + Clone,
@@ -77,13 +77,8 @@ impl RenderSettings {
     }
 
     /// Refuses a view that this device cannot render and train on, from its size alone.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn check_size(
-        &self,
-        gpu: &Gpu,
-        view: &str,
-        [width, height]: [u32; 2],
-    ) -> Result<()> {
+    #[doc(hidden)]
+    pub fn check_size(&self, gpu: &Gpu, view: &str, [width, height]: [u32; 2]) -> Result<()> {
         let Properties { name: device, max_storage_buffer_range: bindable, .. } = gpu.properties();
         let [tile_width, tile_height] = self.tile_for(gpu, std::iter::once([width, height]))?.size;
         let bytes_per_pixel = (self.channels() * size_of::<f32>()) as u64;

@@ -2,17 +2,19 @@
 
 use std::collections::BTreeMap;
 
+use nightsplat_core::camera::CameraModel;
+
 use super::buffers::{RANKS_PER_PARTITION, RenderBuffers, Segments};
 use super::lamp::DeviceLamp;
 use super::limits::{longest_run, segment_length, splats_per_turn};
 use super::{Purpose, RenderSettings, Renderer};
 use crate::Result;
-use crate::camera::CameraModel;
 use crate::gpu::{Gpu, Pipeline, Tile};
 use crate::kernels::{
     blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
 use crate::splats::batches::{GradientKind, rest_by_column};
+use crate::splats::camera::model_number;
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::Shape;
@@ -41,7 +43,7 @@ impl Renderer {
     }
 
     /// [`Renderer::new`] with segments of `segment` splats, a multiple of the subgroup size; 0: a run has one segment.
-    #[cfg(feature = "testing")]
+    #[doc(hidden)]
     pub fn with_segments(gpu: &Gpu, settings: RenderSettings, segment: u32) -> Result<Self> {
         let gradients = WrittenGradients { kind: GradientKind::All, frozen_columns: 0 };
         Self::build(gpu, settings, gradients, settings.tile_on(gpu)?, segment)
@@ -57,8 +59,10 @@ impl Renderer {
         let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
-        let pinhole =
-            ProjectionKind { camera_model: CameraModel::Pinhole.number(), view_depths: false };
+        let pinhole = ProjectionKind {
+            camera_model: model_number(&CameraModel::Pinhole),
+            view_depths: false,
+        };
         let frozen_columns = gradients.frozen_columns;
         let lamp = settings.lamp;
         let lamp = lamp.map(|lamp| DeviceLamp::new(gpu, &settings, tile, frozen_columns, &lamp));
@@ -130,8 +134,8 @@ impl Renderer {
     }
 
     /// Lights the colours with another lamp, or with none.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn set_lamp(&mut self, lamp: Option<Lamp>) -> Result<()> {
+    #[doc(hidden)]
+    pub fn set_lamp(&mut self, lamp: Option<Lamp>) -> Result<()> {
         let settings = RenderSettings { lamp, ..self.settings };
         let frozen_columns = self.gradients.frozen_columns;
         let new = |lamp| DeviceLamp::new(&self.gpu, &settings, self.tile, frozen_columns, &lamp);
@@ -156,15 +160,15 @@ impl Renderer {
     }
 
     /// Switches to another SH degree.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn set_sh_degree(&mut self, sh_degree: u32) -> Result<()> {
+    #[doc(hidden)]
+    pub fn set_sh_degree(&mut self, sh_degree: u32) -> Result<()> {
         if sh_degree == self.settings.shape.sh_degree {
             return Ok(());
         }
         let shape = Shape { sh_degree, ..self.settings.shape };
         let settings = RenderSettings { shape, ..self.settings };
         self.projections = self.built_with(&settings)?;
-        #[cfg(feature = "io")]
+        #[cfg(feature = "train")]
         self.set_context_degree(sh_degree)?;
         self.settings = settings;
         Ok(())

@@ -1,7 +1,8 @@
 //! The settings of a renderer, and the tile that suits a device.
 
+use nightsplat_core::curves::SceneLaw;
+
 use crate::gpu::{Gpu, Properties, Tile};
-use crate::photographs::tone::SceneLaw;
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{Features, Shape};
@@ -99,8 +100,8 @@ fn gpu_tile(properties: &Properties, channels: usize, pixels: Option<u64>) -> Ti
 
 impl RenderSettings {
     /// `RenderSettings::tile_up_to` for views of any size.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn tile_on(&self, gpu: &Gpu) -> Result<Tile> {
+    #[doc(hidden)]
+    pub fn tile_on(&self, gpu: &Gpu) -> Result<Tile> {
         self.tile_up_to(gpu, None)
     }
 
@@ -127,8 +128,8 @@ impl RenderSettings {
     }
 
     /// Values per pixel of a render: RGB and the features.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn channels(&self) -> usize {
+    #[doc(hidden)]
+    pub fn channels(&self) -> usize {
         self.shape.features.channels()
     }
 

@@ -3,15 +3,15 @@
 use std::fmt::Debug;
 
 use glam::Vec3;
+use nightsplat_core::camera::{Camera, deviation_from_rigid};
+use nightsplat_core::curves::SceneLaw;
 
-use crate::camera::{Camera, deviation_from_rigid};
 use crate::gpu::{HostImage, ImageFormat};
 use crate::kernels::depth_limits;
 use crate::kernels::pixels::{
     DEPTH_16, DEPTH_24, DEPTH_FLOAT, PIXELS_DISPLAY_HALF, PIXELS_LINEAR_HALF, PIXELS_SRGB,
     PIXELS_UNORM,
 };
-use crate::photographs::tone::SceneLaw;
 use crate::{Error, Result};
 
 /// The images of a draw. Camera `i` is drawn into layer `layer + i` of each.

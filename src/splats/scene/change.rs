@@ -46,8 +46,8 @@ impl Gaussians {
     }
 
     /// Removes the Gaussians whose `keep` is false; the others keep their order.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn retain(&mut self, keep: &[bool]) {
+    #[doc(hidden)]
+    pub fn retain(&mut self, keep: &[bool]) {
         let kept = keep.iter().filter(|keep| **keep).count();
         if kept == self.count {
             return;
@@ -66,8 +66,8 @@ impl Gaussians {
     }
 
     /// These Gaussians, in this order.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn select(&self, indices: &[u32]) -> Self {
+    #[doc(hidden)]
+    pub fn select(&self, indices: &[u32]) -> Self {
         let mut some = Self::zeros(indices.len(), self.shape);
         some.origin = self.origin;
         for spec in &ATTRIBUTES {
@@ -84,8 +84,8 @@ impl Gaussians {
 
     /// Gaussians of one shape, one after the other, at least one set of them; the positions of all stay where they are
     /// in the world, relative to the first one's origin.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn concatenated(parts: &[&Self]) -> Self {
+    #[doc(hidden)]
+    pub fn concatenated(parts: &[&Self]) -> Self {
         let (shape, origin) = (parts[0].shape, parts[0].origin);
         let mut all = Self::zeros(parts.iter().map(|part| part.count).sum(), shape);
         all.origin = origin;
@@ -210,8 +210,8 @@ impl Lengths {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::base::random::Stream;
     use crate::splats::scene::{Features, Shape, width};
+    use nightsplat_core::random::Stream;
 
     fn drawn(count: usize, seed: u64) -> Gaussians {
         let shape = Shape { sh_degree: 2, features: Features { noise: true, ..Features::NONE } };

@@ -24,14 +24,14 @@ pub struct Layout {
 
 impl Layout {
     /// The layout of `count` Gaussians, without headroom.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn new(count: usize, shape: impl Into<Shape>, sh_rest: StorageFormat) -> Self {
+    #[doc(hidden)]
+    pub fn new(count: usize, shape: impl Into<Shape>, sh_rest: StorageFormat) -> Self {
         Self { count, capacity: count, shape: shape.into(), sh_rest }
     }
 
     /// The dimensions of planes with one float per parameter, such as gradients and moments.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn floats(&self) -> PlaneCounts {
+    #[doc(hidden)]
+    pub fn floats(&self) -> PlaneCounts {
         let features = self.shape.features.width();
         PlaneCounts { gaussians: self.count, columns: width(self.shape), features }
     }
@@ -42,8 +42,8 @@ impl Layout {
     }
 
     /// The batches of planes with one float per parameter.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn batches(&self, gpu: &Gpu) -> Batches {
+    #[doc(hidden)]
+    pub fn batches(&self, gpu: &Gpu) -> Batches {
         Batches::new(gpu, self.floats())
     }
 
@@ -81,8 +81,8 @@ impl<'a> From<&'a DeviceGaussians> for GaussianSlice<'a> {
 
 impl DeviceGaussians {
     /// Allocates Gaussians with uninitialised parameters.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn uninit(gpu: &Gpu, layout: Layout) -> Result<Self> {
+    #[doc(hidden)]
+    pub fn uninit(gpu: &Gpu, layout: Layout) -> Result<Self> {
         let len = layout.capacity.max(layout.count) * layout.words();
         let window = layout.parameter_batches(gpu).window();
         let parameters = gpu.uninit_in_windows("parameters", len, window)?;
@@ -90,14 +90,14 @@ impl DeviceGaussians {
     }
 
     /// Borrows them for rendering.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn slice(&self) -> GaussianSlice<'_> {
+    #[doc(hidden)]
+    pub fn slice(&self) -> GaussianSlice<'_> {
         GaussianSlice { layout: self.layout, parameters: self.parameters.slice() }
     }
 
     /// Overwrites the parameters with planes of floats.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn write(&mut self, gpu: &Gpu, floats: &[f32]) -> Result<()> {
+    #[doc(hidden)]
+    pub fn write(&mut self, gpu: &Gpu, floats: &[f32]) -> Result<()> {
         let batches = self.layout.parameter_batches(gpu);
         match self.layout.sh_rest {
             StorageFormat::Single => batches.write(gpu, &mut self.parameters, floats),
@@ -109,8 +109,8 @@ impl DeviceGaussians {
     }
 
     /// The parameters as planes of floats.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
+    #[doc(hidden)]
+    pub fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
         let words = self.layout.parameter_batches(gpu).read(gpu, &self.parameters)?;
         Ok(match self.layout.sh_rest {
             StorageFormat::Single => words,
@@ -138,8 +138,8 @@ impl Gaussians {
     }
 
     /// A copy on the device, SH coefficients above degree 0 in the format `sh_rest`.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn upload_as(&self, gpu: &Gpu, sh_rest: StorageFormat) -> Result<DeviceGaussians> {
+    #[doc(hidden)]
+    pub fn upload_as(&self, gpu: &Gpu, sh_rest: StorageFormat) -> Result<DeviceGaussians> {
         let mut gaussians =
             DeviceGaussians::uninit(gpu, Layout::new(self.count, self.shape, sh_rest))?;
         gaussians.origin = self.origin;

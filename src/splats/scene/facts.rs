@@ -4,9 +4,8 @@ use std::fmt::Display;
 use std::str::FromStr;
 
 use glam::DVec3;
+use nightsplat_core::curves::SceneLaw;
 use serde_json::{Map, Value};
-
-use crate::photographs::tone::SceneLaw;
 
 /// Facts that a file states about its model, each with a key and a value, such as `near 0.1`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -81,14 +81,14 @@ impl Features {
     }
 
     /// Floats per Gaussian.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn width(self) -> usize {
+    #[doc(hidden)]
+    pub fn width(self) -> usize {
         self.specs().map(|spec| spec.width).sum()
     }
 
     /// Channels of a render: RGB and the features.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn channels(self) -> usize {
+    #[doc(hidden)]
+    pub fn channels(self) -> usize {
         COLOR_CHANNELS + self.width()
     }
 

@@ -5,15 +5,16 @@ use std::ops::Bound::Excluded;
 
 use glam::{DMat3, DQuat, DVec2, DVec3, Vec3};
 use nalgebra::{Matrix3, SymmetricEigen};
+use nightsplat_core::camera::Camera;
+use nightsplat_core::random::Stream;
+use nightsplat_core::settings;
+use nightsplat_core::settings::Rule;
+use nightsplat_photographs::dataset::{Point, Split, View};
+use nightsplat_photographs::image::Image;
 use rayon::prelude::*;
 
 use super::neighbours::Neighbours;
 use super::{Gaussians, SH_C0, Shape};
-use crate::base::random::Stream;
-use crate::base::settings::{Rule, settings};
-use crate::camera::Camera;
-use crate::photographs::dataset::{Point, Split, View};
-use crate::photographs::image::Image;
 use crate::{Error, Result};
 
 settings! {
@@ -37,7 +38,7 @@ pub struct Initialization {
 
 impl Initialization {
     /// The initialization of 3DGS and of the paper.
-    #[cfg(feature = "testing")]
+    #[doc(hidden)]
     pub const PAPER: Self = Self { opacity: 0.1, scale: 1.0, min_axis_ratio: 1.0 };
 
     /// Checks the values.

@@ -84,7 +84,7 @@ fn split(positions: &mut [(DVec3, u32)], axes: &mut [usize]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::base::random::Stream;
+    use nightsplat_core::random::Stream;
 
     #[test]
     fn the_nearest_are_those_of_an_exhaustive_search() {

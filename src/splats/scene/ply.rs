@@ -8,7 +8,7 @@
 //! Normals are zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid,
 //! scales are logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
 
-#[cfg(feature = "io")]
+#[cfg(feature = "train")]
 pub(crate) mod parts;
 mod text;
 
@@ -17,10 +17,11 @@ use std::fs;
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
 
+use nightsplat_core::input;
+use nightsplat_core::output::write_whole_with;
+use nightsplat_core::ply::{PlyEncoding, PlyHeader, PlyScalar};
+
 use super::{FEATURES, Feature, Features, Gaussians, MAX_SH_DEGREE, ModelFacts, Shape, width};
-use crate::base::input;
-use crate::base::output::write_whole_with;
-use crate::base::ply::{PlyEncoding, PlyHeader, PlyScalar};
 use crate::splats::attributes::{
     ATTRIBUTES, Attribute, AttributePlane, AttributeSpec, Ply, planes, rest_coefficients,
 };
@@ -86,7 +87,6 @@ impl Gaussians {
 }
 
 /// Writes `gaussians` to `path` atomically.
-#[cfg(any(test, feature = "testing"))]
 pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
     save_with_comments(gaussians, path, &[""; 0])
 }
@@ -177,7 +177,7 @@ impl Writer {
 /// Reads Gaussians from a PLY, binary little-endian or text; unknown properties are skipped.
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
-    #[cfg(feature = "io")]
+    #[cfg(feature = "train")]
     parts::PartFile::open(path, 1)?;
     let bytes = input::bytes(path)?;
     let (gaussians, _) = parse(&bytes).map_err(|problem| Error::input(path, problem))?;
@@ -218,7 +218,7 @@ struct PlyLayout {
     shape: Shape,
     facts: ModelFacts,
     /// Bytes before the first vertex.
-    #[cfg(feature = "io")]
+    #[cfg(feature = "train")]
     length: usize,
     /// Bytes of a vertex.
     stride: usize,
@@ -253,7 +253,7 @@ impl PlyLayout {
             count,
             shape,
             facts,
-            #[cfg(feature = "io")]
+            #[cfg(feature = "train")]
             length: header.length,
             stride,
             properties,

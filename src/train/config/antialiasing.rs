@@ -1,6 +1,7 @@
 //! Settings against aliasing.
 
-use crate::base::settings::{Rule, settings};
+use nightsplat_core::settings;
+use nightsplat_core::settings::Rule;
 
 settings! {
 "antialiasing."

@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use crate::base::settings::{Rule, settings};
+use nightsplat_core::settings;
+use nightsplat_core::settings::Rule;
+
 use crate::loss::exposure::ExposureRates;
 
 settings! {

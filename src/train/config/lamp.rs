@@ -1,8 +1,11 @@
 //! Settings of a lamp that moves with the camera.
 
-use crate::base::settings::{Rule, settings};
-use crate::kernels::lamp::LAMP_LARGEST_EXPONENT;
 use std::ops::Bound;
+
+use nightsplat_core::settings;
+use nightsplat_core::settings::Rule;
+
+use crate::kernels::lamp::LAMP_LARGEST_EXPONENT;
 
 settings! {
 "lamp."

@@ -1,9 +1,10 @@
 //! Early stopping.
 
+use nightsplat_core::settings;
+use nightsplat_core::settings::Rule;
 use serde::{Deserialize, Serialize};
 
 use super::TrainConfig;
-use crate::base::settings::{Rule, settings};
 
 settings! {
 "stop."

@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 
 use glam::DVec2;
+use nightsplat_core::camera::Camera;
+use nightsplat_photographs::dataset::{Dataset, Point, View};
+use nightsplat_photographs::image::{Image, linear_from_srgb};
+use nightsplat_photographs::tone::{bounded, luminance};
 use rayon::prelude::*;
 
 use crate::Result;
-use crate::camera::Camera;
-use crate::photographs::dataset::{Dataset, Point, View};
-use crate::photographs::image::{Image, linear_from_srgb};
-use crate::photographs::tone::{bounded, luminance};
 use crate::splats::scene::init;
 
 /// Random points in front of the cameras if the dataset has none.

@@ -175,7 +175,7 @@ fn line(bins: &[Bin]) -> ChannelNoise {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::base::random::Stream;
+    use nightsplat_core::random::Stream;
 
     const WIDTH: usize = 512;
 
@@ -215,8 +215,9 @@ mod tests {
     #[test]
     fn the_slope_is_the_derivative_of_the_transfer_function() {
         for linear in [0.001, 0.02, 0.4] {
-            let encoded =
-                |linear: f64| f64::from(crate::photographs::image::srgb_from_linear(linear as f32));
+            let encoded = |linear: f64| {
+                f64::from(nightsplat_photographs::image::srgb_from_linear(linear as f32))
+            };
             let numeric =
                 (1.01 * linear - 0.99 * linear) / (encoded(1.01 * linear) - encoded(0.99 * linear));
             assert!((slope(linear) / numeric - 1.0).abs() < 1e-2, "{linear}");

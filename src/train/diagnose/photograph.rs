@@ -1,12 +1,14 @@
 //! Measurements of one photograph, as stored: brightness, code values, noise, blur.
 
+use nightsplat_photographs::image::{Image, Mask, linear_from_srgb};
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tone::{
+    MeasuredPhotograph, NEAR_WHITE, ToneSettings, bounded, luminance, measurable,
+};
+
 use super::noise::{self, ChannelNoise, NoisePatch};
 use super::sharpness;
 use super::target_noise::{TargetNoise, target_noise};
-use crate::photographs::image::{Image, Mask, linear_from_srgb};
-use crate::photographs::targets::SceneTone;
-use crate::photographs::tone::NEAR_WHITE;
-use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, bounded, luminance, measurable};
 
 /// Blur is measured in the middle of the photograph, in at most this many pixels each way.
 const BLUR_SIDE: u32 = 640;
@@ -66,7 +68,7 @@ impl PhotographStatistics {
             patches,
             blur: blur(image),
             unevenness: unevenness(&luminance, image.width as usize),
-            checksum: crate::base::hash::checksum(bytemuck::cast_slice(&image.data)),
+            checksum: nightsplat_core::hash::checksum(bytemuck::cast_slice(&image.data)),
         }
     }
 }

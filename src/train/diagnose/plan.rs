@@ -2,14 +2,14 @@
 
 use std::path::Path;
 
+use nightsplat_core::input;
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::findings::too_near_white;
+use nightsplat_photographs::tone::{Tone, ToneCurve};
 use serde::{Deserialize, Serialize};
 use toml::Value;
 
 use super::{Diagnosis, SceneDiagnosis};
-use crate::base::input;
-use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::findings::too_near_white;
-use crate::photographs::tone::{Tone, ToneCurve};
 use crate::splats::scene::{Features, Shape, width};
 use crate::train::layers::{Origin, SettingsLayer};
 use crate::train::{LampConfig, TrainConfig};
@@ -160,8 +160,7 @@ pub struct Plan {
 impl Plan {
     /// Plans the model of a capture, within the steps, schedule and limits of a configuration, for a device with
     /// `memory` bytes.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn new(diagnosis: &Diagnosis, config: &TrainConfig, memory: u64) -> Self {
+    pub fn new(diagnosis: &Diagnosis, config: &TrainConfig, memory: u64) -> Self {
         let scene = &diagnosis.scene;
         let sh_degree = sh_degree(scene, config);
         let curve = curve(scene, config);
@@ -216,8 +215,7 @@ impl Plan {
     }
 
     /// Name, decision and reason of every item.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn decisions<'a>(&'a self) -> Vec<(&'static str, String, &'a str)> {
+    pub fn decisions<'a>(&'a self) -> Vec<(&'static str, String, &'a str)> {
         let switch = |on: bool| if on { "on" } else { "off" }.to_owned();
         let part = |name, part: &'a PlannedPart| (name, switch(part.on), part.why.as_str());
         let number = |name, it: &'a PlannedNumber| (name, it.value.to_string(), it.why.as_str());
@@ -236,8 +234,7 @@ impl Plan {
     }
 
     /// The plan as TOML.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn to_toml(&self) -> Result<String> {
+    pub fn to_toml(&self) -> Result<String> {
         const HEAD: &str = "# What this capture needs, and why. Change what you know better and pass it to \
                             `nightsplat train --plan FILE`.\n\n";
         let text = toml::to_string(self).map_err(|error| Error::Usage(error.to_string()))?;
@@ -245,8 +242,7 @@ impl Plan {
     }
 
     /// Reads the plan of a dataset.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
+    pub fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
         let plan = Self::read(path)?;
         let loaded = PlannedViews::new(dataset);
         if plan.dataset != loaded {

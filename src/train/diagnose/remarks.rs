@@ -1,8 +1,9 @@
 //! What is odd about photographs at points that several of them show.
 
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, MeasuredSize, View};
+
 use super::geometry::SceneGeometry;
 use super::lamp::{LampObservations, bands, falloff::FalloffDiagnosis};
-use crate::photographs::dataset::{Dataset, LoadOptions, MeasuredSize, View};
 use crate::train::TrainConfig;
 
 /// Remarks on rows and corners of a dataset's training photographs, at shared points; none if it cannot be loaded.

@@ -73,7 +73,7 @@ fn blurred(plane: &[f32], width: usize, sigma: f64) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::base::random::Stream;
+    use nightsplat_core::random::Stream;
 
     #[test]
     fn the_blur_of_an_edge_is_found_despite_noise() {

@@ -6,11 +6,11 @@
 //! JPEG chroma block. Among the patches of medium brightness, half show texture, which is mostly grey: luma is the
 //! first quartile of the patches, chroma their median.
 
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::tone::{InverseTone, bounded, luminance};
 use serde::Serialize;
 
 use super::geometry::median;
-use crate::photographs::image::Image;
-use crate::photographs::tone::{InverseTone, bounded, luminance};
 
 /// Side of a patch, pixels.
 const SIDE: u32 = 32;
@@ -115,10 +115,11 @@ fn variance_about_plane(values: &[f64], side: usize) -> f64 {
 mod tests {
     use super::super::noise;
     use super::*;
-    use crate::base::random::Stream;
-    use crate::photographs::image::linear_from_srgb;
-    use crate::photographs::targets::SceneTone;
-    use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, soft};
+    use nightsplat_core::random::Stream;
+    use nightsplat_photographs::image::ImageFile as _;
+    use nightsplat_photographs::image::linear_from_srgb;
+    use nightsplat_photographs::scene_tone::SceneTone;
+    use nightsplat_photographs::tone::{MeasuredPhotograph, ToneSettings, soft};
 
     const SIZE: [u32; 2] = [512, 384];
 

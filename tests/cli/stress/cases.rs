@@ -1,14 +1,14 @@
 //! The table of hostile inputs.
 
 use glam::Vec3;
-
-use super::hostile::{Hostile, camera_of_focal};
 use nightsplat::Result;
-use nightsplat::base::random::Stream;
 use nightsplat::gpu::Gpu;
-use nightsplat::photographs::tone::ToneSettings;
 use nightsplat::splats::render::RenderSettings;
 use nightsplat::splats::scene::Gaussians;
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::tone::ToneSettings;
+
+use super::hostile::{Hostile, camera_of_focal};
 
 /// An input and its expected outcome.
 #[derive(Debug)]

@@ -4,18 +4,17 @@ use std::ops::Range;
 use std::path::PathBuf;
 
 use glam::{DVec2, DVec3, Vec3};
-
-use nightsplat::base::random::Stream;
-use nightsplat::camera::{Camera, TrainingFrame};
 use nightsplat::cli::bench::scene;
 use nightsplat::loss::exposure::{Affine, table};
-use nightsplat::photographs::dataset::synthetic;
-use nightsplat::photographs::dataset::{Dataset, Point, Split, View};
-use nightsplat::photographs::image::{Image, linear_from_srgb};
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::TrainConfig;
 use nightsplat::{Error, Result};
+use nightsplat_core::camera::{Camera, TrainingFrame};
+use nightsplat_core::random::Stream;
+use nightsplat_photographs::dataset::{Dataset, Point, Split, View};
+use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb};
+use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat_synth;
 
 use crate::common::train::small_set;
 
@@ -120,7 +119,7 @@ impl Hostile {
         let files = tempfile::tempdir()
             .map_err(|error| Error::output(std::env::temp_dir(), error.to_string()))?;
         let options = small_set(4, [32, 24], 14);
-        synthetic::write(files.path(), &options)?;
+        nightsplat_synth::write(files.path(), &options)?;
         let low = files.path().join("low");
         for name in 0..options.views {
             let png = low.join(format!("{name:03}.png"));

@@ -1,8 +1,8 @@
 //! A host's image in the light of the photographs.
 
 use nightsplat::kernels::photograph_light;
-use nightsplat::photographs::tone::{
-    FAMILIES, InverseTone, SceneLaw, Tone, ToneCurve, ToneParameters, ToneSettings,
+use nightsplat_photographs::tone::{
+    FAMILIES, InverseTone, SceneLaw, Tone, ToneCurve, ToneParameters, ToneSettings, scene_law,
 };
 
 use super::*;
@@ -16,8 +16,8 @@ fn parameters(share: f32, weight: f32) -> ToneParameters {
 }
 
 /// The law of dark photographs.
-pub(crate) fn law() -> SceneLaw {
-    SceneLaw::new(&ToneSettings::new(Tone::Auto), &parameters(1.0 / 3.0, 1.0)).unwrap()
+fn law() -> SceneLaw {
+    scene_law(&ToneSettings::new(Tone::Auto), &parameters(1.0 / 3.0, 1.0)).unwrap()
 }
 
 /// Black, the black level, no number, beyond white, clipped, and everything between in all three channels.

@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use nightsplat::cli::tone::fit::{ChannelChoice, FamilyChoice, FitArgs, WeightingChoice, apply};
-use nightsplat::photographs::tone::CurveChoice;
+use nightsplat_photographs::image::ImageFile as _;
+use nightsplat_photographs::tone::CurveChoice;
 
 use super::*;
 

@@ -2,10 +2,11 @@
 
 use std::path::Path;
 
-use nightsplat::photographs::fit::{
+use nightsplat_fit::{
     ColourPair, ColourScene, cross_validate_profile, fit_profile, profile_scores,
 };
-use nightsplat::photographs::tone::Profile;
+use nightsplat_photographs::image::ImageFile as _;
+use nightsplat_photographs::tone::Profile;
 
 use super::*;
 
@@ -30,8 +31,8 @@ fn scene(folder: &Path, exposures: &[f64], noise: f64) {
     }
     let (first, stream) = (dark(120, 0.04, 0.0, 5), Stream::new(5, 9));
     // The gain at which the rule gives the first photograph, by itself, its brightness.
-    let luminance = nightsplat::photographs::tone::LuminanceHistogram::new(&first.data);
-    let gain = nightsplat::photographs::tone::Exposure::measure([&luminance], None).unwrap().gain;
+    let luminance = nightsplat_photographs::tone::LuminanceHistogram::new(&first.data);
+    let gain = nightsplat_photographs::tone::Exposure::measure([&luminance], None).unwrap().gain;
     for (index, exposure) in exposures.iter().enumerate() {
         let scaled = first.data.iter().map(|x| (f64::from(*x) * exposure) as f32);
         let low = Image { data: scaled.collect(), ..first };

@@ -4,8 +4,8 @@ use std::fs;
 use std::path::Path;
 
 use glam::DVec2;
-use nightsplat::camera::{Camera, CameraModel, KannalaBrandt};
-use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat_core::camera::{Camera, CameraModel, KannalaBrandt};
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
 use serde_json::json;
 
 use super::synthetic::*;

@@ -3,7 +3,7 @@
 use std::fs;
 
 use glam::DVec3;
-use nightsplat::photographs::dataset::{LoadOptions, Split};
+use nightsplat_photographs::dataset::{LoadOptions, Split};
 use serde_json::json;
 
 use super::synthetic::*;

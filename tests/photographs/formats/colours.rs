@@ -4,8 +4,8 @@ use std::fs;
 use std::path::Path;
 
 use nightsplat::LoadOptions;
-use nightsplat::photographs::dataset::{Dataset, View};
-use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
+use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
 
 use super::synthetic::*;
 use super::{load, view};

@@ -5,8 +5,8 @@ use std::fs;
 use std::path::Path;
 
 use glam::{DMat3, DVec3};
-use nightsplat::photographs::dataset::{Dataset, DepthOptions, LoadOptions, Split};
-use nightsplat::photographs::image::Image;
+use nightsplat_photographs::dataset::{Dataset, DepthOptions, LoadOptions, Split};
+use nightsplat_photographs::image::{Image, ImageFile};
 use serde::Serialize;
 use serde_json::json;
 

@@ -5,9 +5,9 @@ use std::fs::File;
 use std::io::Write;
 use std::path::Path;
 
-use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
-use nightsplat::photographs::image::Image;
 use nightsplat::train::diagnose::Diagnosis;
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat_photographs::image::{Image, ImageFile};
 use serde_json::json;
 use zip::write::{SimpleFileOptions, ZipWriter};
 

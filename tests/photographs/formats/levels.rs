@@ -1,7 +1,7 @@
 //! Levels of the files of a set: the same for all of its photographs.
 
 use ::image::{ImageBuffer, Rgb};
-use nightsplat::photographs::image::{StoredLight, linear_from_srgb, srgb_from_linear};
+use nightsplat_photographs::image::{StoredLight, linear_from_srgb, srgb_from_linear};
 
 use super::*;
 

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use nightsplat::camera::{CameraModel, KannalaBrandt};
+use nightsplat_core::camera::{CameraModel, KannalaBrandt};
 
 use super::synthetic::*;
 use super::{load, refuses};

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec3};
 use image::{ImageBuffer, Luma, Rgb, Rgba};
-use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
-use nightsplat::photographs::image::{Image, Mask, Orientation};
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat_photographs::image::{Image, ImageFile, Mask, Orientation};
 use serde_json::json;
 
 use super::synthetic::*;
@@ -179,7 +179,7 @@ fn a_photograph_is_rotated_if_its_camera_is_upright_and_else_kept_as_stored() {
             let stated = Orientation::from_file(&lone);
             let left = if is_turned { Orientation::UPRIGHT } else { stated };
             assert_eq!(view(&dataset, "v03").orientation, left);
-            let upright = Image::load(&lone).unwrap().turned(Orientation::from_file(&lone));
+            let upright = Orientation::from_file(&lone).upright(Image::load(&lone).unwrap());
             assert_eq!((upright.width, upright.height), Orientation::from_file(&lone).size(stored));
         }
         jpeg(&root.join("images/v03.jpg"), (36, 40), orientation);

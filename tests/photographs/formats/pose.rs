@@ -4,9 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use nightsplat::photographs::dataset::Split;
-use nightsplat::photographs::dataset::synthetic;
-use nightsplat::photographs::image::Image;
+use nightsplat_photographs::dataset::Split;
+use nightsplat_photographs::image::{Image, ImageFile};
 
 use super::load;
 use super::synthetic::*;
@@ -429,7 +428,7 @@ fn colmap_finds_the_cameras_of_a_dark_set_with_a_date_burnt_into_it() {
     }
     let root = &Folder::empty();
     let options = small_set(20, [200, 150], 3);
-    synthetic::write(root.join("set"), &options).unwrap();
+    nightsplat_synth::write(root.join("set"), &options).unwrap();
     let photos = root.join("set/low");
     burn_in_text(&photos);
     let out = root.join("scene");
@@ -438,7 +437,7 @@ fn colmap_finds_the_cameras_of_a_dark_set_with_a_date_burnt_into_it() {
     assert!(found.views.len() >= 15, "{} of 20", found.views.len());
     assert!(found.points.len() > 50, "{} points", found.points.len());
     // Distances between cameras, whose scale is free.
-    let center = |name: &str, set: &nightsplat::photographs::dataset::Dataset| {
+    let center = |name: &str, set: &nightsplat_photographs::dataset::Dataset| {
         super::view(set, name).camera.center()
     };
     let names: Vec<&str> = found.views.iter().map(|view| view.name.as_str()).collect();

@@ -3,8 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use nightsplat::photographs::dataset::synthetic;
-use nightsplat::photographs::image::Image;
+use nightsplat_photographs::image::{Image, ImageFile};
 
 use super::load;
 use super::pose::{is_installed, line, photographed, stub};
@@ -102,7 +101,7 @@ fn colmap_poses_dark_photographs_through_bright_ones_of_other_views() {
     }
     let root = &Folder::empty();
     let options = small_set(24, [200, 150], 3);
-    synthetic::write(root.join("set"), &options).unwrap();
+    nightsplat_synth::write(root.join("set"), &options).unwrap();
     // Every sixth view is dark.
     for index in 0..options.views {
         let (from, to) = if index % 6 == 0 { ("low", "night") } else { ("high", "day") };
@@ -117,7 +116,7 @@ fn colmap_poses_dark_photographs_through_bright_ones_of_other_views() {
         (load(&root.join("set")), load(&root.join("scene")), load(&root.join("scene/bright")));
     assert!(dark.views.len() >= 3 && bright.views.len() >= 15, "{} dark", dark.views.len());
     // Distances of every dark camera from the bright ones, whose scale is free.
-    let center = |set: &nightsplat::photographs::dataset::Dataset, name: &str| {
+    let center = |set: &nightsplat_photographs::dataset::Dataset, name: &str| {
         super::view(set, name).camera.center()
     };
     let mut distances = vec![];

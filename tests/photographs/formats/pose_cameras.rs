@@ -4,11 +4,12 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
+use nightsplat_photographs::image::{Image, ImageFile};
+
 use super::load;
 use super::pose::{line, models, photographed, stub};
 use super::synthetic::*;
 use crate::common::command::{refused, run};
-use nightsplat::photographs::image::Image;
 
 /// Copies a photograph and sets its equivalent focal length in Exif.
 fn taken_at(path: &Path, focal: u8) {

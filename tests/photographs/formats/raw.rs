@@ -4,11 +4,11 @@ use std::fs;
 use std::path::Path;
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
-use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::targets::SceneTone;
-use nightsplat::photographs::tone::{InverseTone, MeasuredPhotograph, ToneCurve, ToneSettings};
+use nightsplat::targets::pseudo_gt::PseudoGt;
+use nightsplat_photographs::image::{Image, linear_from_srgb, srgb_from_linear};
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tone::{InverseTone, MeasuredPhotograph, ToneCurve, ToneSettings};
+use nightsplat_synth::SyntheticOptions;
 
 use super::Folder;
 use crate::common::Random;
@@ -251,7 +251,7 @@ fn trained(set: &Path) -> f64 {
 
 /// Writes a synthetic set whose photographs are RAW, and returns their number.
 fn raw_set(set: &Path, options: &SyntheticOptions) -> usize {
-    synthetic::write(set, options).unwrap();
+    nightsplat_synth::write(set, options).unwrap();
     let mut count = 0;
     for entry in fs::read_dir(set.join("low")).unwrap() {
         let path = entry.unwrap().path();
@@ -272,7 +272,7 @@ fn photographs_in_raw_train_as_the_same_light_in_another_format() {
     let [encoded, raw] = ["encoded", "raw"].map(|name| folder.join(name));
     let options =
         SyntheticOptions { views: 9, width: 48, height: 36, ..SyntheticOptions::default() };
-    synthetic::write(&encoded, &options).unwrap();
+    nightsplat_synth::write(&encoded, &options).unwrap();
     assert!(raw_set(&raw, &options) >= 8);
     let (encoded, raw) = (trained(&encoded), trained(&raw));
     assert!((encoded - raw).abs() < 0.1, "{encoded} dB of PNG, {raw} dB of RAW");

@@ -1,7 +1,7 @@
 //! Real captures: committed excerpts, and the full ones if available.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
-use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
 
 use super::{level, load, names, view};
 use crate::common::{fixture, shared};
@@ -132,7 +132,7 @@ fn the_fox_splits_by_its_list_and_scores_against_normal_light() {
     let listed: Vec<_> = listed.lines().map(|line| line.trim_end_matches(".png")).collect();
     assert_eq!((dataset.views.len(), names(&dataset, Split::Test)), (50, listed.clone()));
     let test = view(&dataset, listed[0]);
-    let mean = |image: &nightsplat::photographs::image::Image| {
+    let mean = |image: &nightsplat_photographs::image::Image| {
         image.data.iter().sum::<f32>() / image.data.len() as f32
     };
     let (low, normal) =

@@ -5,7 +5,7 @@ use std::ops::Deref;
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
-use nightsplat::photographs::image::Image;
+use nightsplat_photographs::image::{Image, ImageFile};
 use serde_json::{Value, json};
 
 pub(crate) const SIZE: (u32, u32) = (40, 30);

@@ -6,8 +6,8 @@ use std::path::Path;
 
 use glam::{DVec2, DVec3};
 use image::{ImageBuffer, Luma};
-use nightsplat::photographs::dataset::{Dataset, LoadOptions, PixelOrientation};
-use nightsplat::photographs::image::{Image, Orientation};
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, PixelOrientation};
+use nightsplat_photographs::image::{Image, Orientation};
 
 use super::photographs::orient;
 use super::synthetic::*;
@@ -108,7 +108,7 @@ fn turned(image: Image, orientation: u8) -> Image {
     let path = folder.join("a.jpg");
     write(&Image::filled(8, 8, [0.0; 3]), &path);
     orient(&path, orientation);
-    image.turned(Orientation::from_file(&path))
+    Orientation::from_file(&path).upright(image)
 }
 
 fn loaded(root: &Path, orientation: PixelOrientation) -> (Dataset, String) {

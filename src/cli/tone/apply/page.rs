@@ -2,13 +2,14 @@
 
 use std::path::Path;
 
+use nightsplat_core::output::write_whole;
+use nightsplat_photographs::image::Image;
+use nightsplat_photographs::metrics::Scores;
+
 use super::photographs::InputPhotograph;
 use super::{ApplyArgs, CurveOnSet, Mapped, Measures, ToneOutput, without};
 use crate::Result;
-use crate::base::output::write_whole;
 use crate::gpu::Gpu;
-use crate::photographs::image::Image;
-use crate::photographs::metrics::Scores;
 use crate::results::eval;
 use crate::results::report::{
     Best, Column, Comparison, Distribution, NumberTable, Picture, Report, distributions,

@@ -4,16 +4,17 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::ApplyArgs;
-use crate::base::output::is_same_file;
-use crate::base::tree;
-use crate::cli::OutputFormat;
-use crate::photographs::dataset::{Borders, Dataset, LoadOptions, Photograph, Split};
-use crate::photographs::image::files::{photographs_in, unread_in};
-use crate::photographs::image::{
+use nightsplat_core::output::is_same_file;
+use nightsplat_photographs::dataset::{Borders, Dataset, LoadOptions, Photograph, Split};
+use nightsplat_photographs::image::files::{photographs_in, unread_in};
+use nightsplat_photographs::image::{
     ColourCounts, Image, Levels, Mask, MaskFile, Orientation, PictureFile,
 };
-use crate::photographs::white_balance::WhiteBalanceMatrix;
+use nightsplat_photographs::tree;
+use nightsplat_photographs::white_balance::WhiteBalanceMatrix;
+
+use super::ApplyArgs;
+use crate::cli::OutputFormat;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
@@ -74,10 +75,10 @@ impl InputPhotograph {
         } else {
             let mut marked = Image::filled(image.width, image.height, [0.0; 3]);
             gaps.iter().for_each(|&gap| marked.data[gap] = 1.0);
-            let marked = marked.turned(orientation).data;
+            let marked = orientation.upright(marked).data;
             (0..image.pixel_count()).filter(|&pixel| is_gap(&marked[pixel])).collect()
         };
-        (image.turned(orientation), gaps)
+        (orientation.upright(image), gaps)
     }
 }
 

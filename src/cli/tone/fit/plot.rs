@@ -1,8 +1,9 @@
 //! Plot of the pairs and the curves as an SVG file.
 
+use nightsplat_fit::{Channels, FitOptions, Histogram, Pair};
+use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
+
 use super::Fitted;
-use crate::photographs::fit::{Channels, FitOptions, Histogram, Pair};
-use crate::photographs::tone::{Statistics, ToneCurve, ToneSettings};
 use crate::results::report::{Chart, Series};
 
 /// Share of the pixels that the t axis covers.
@@ -35,7 +36,7 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
     let line = |name: &str, deviations: f64| {
         let columns = pooled.columns.iter();
         let columns = columns.filter(|column| column.count > MIN_COLUMN * count && column.x <= end);
-        let point = |column: &crate::photographs::fit::HistogramColumn| {
+        let point = |column: &nightsplat_fit::HistogramColumn| {
             let mean = column.sum_y / column.count;
             let deviation = (column.sum_y2 / column.count - mean * mean).max(0.0).sqrt();
             (column.x, mean + deviations * deviation)

@@ -1,16 +1,16 @@
 //! `nightsplat tone fit --profile`: fits a camera profile in place of a curve.
 
+use nightsplat_core::output::write_whole;
+use nightsplat_fit::{
+    ColourPair, ColourScene, ProfileFold, ProfileScores, cross_validate_profile, fit_profile,
+    profile_scores,
+};
+use nightsplat_photographs::tone::Profile;
 use serde::Serialize;
 
 use super::FitArgs;
 use crate::Result;
-use crate::base::output::write_whole;
 use crate::cli::table::aligned;
-use crate::photographs::fit::{
-    ColourPair, ColourScene, ProfileFold, ProfileScores, cross_validate_profile, fit_profile,
-    profile_scores,
-};
-use crate::photographs::tone::Profile;
 
 /// A fitted profile.
 #[derive(Clone, Debug, Serialize)]

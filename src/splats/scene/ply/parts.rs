@@ -4,9 +4,10 @@ use std::fs::File;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::output::write_whole_with;
+use nightsplat_core::ply::{PlyEncoding, PlyHeader};
+
 use super::{PlyLayout, Writer, comment_lines};
-use crate::base::output::write_whole_with;
-use crate::base::ply::{PlyEncoding, PlyHeader};
 use crate::splats::scene::{Gaussians, ModelFacts, Shape};
 use crate::{Error, Result};
 
@@ -110,7 +111,7 @@ pub(crate) fn save_parts(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::base::random::Stream;
+    use nightsplat_core::random::Stream;
 
     #[test]
     fn parts_are_the_whole_and_write_the_same_bytes() {

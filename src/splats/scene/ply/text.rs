@@ -1,8 +1,7 @@
 //! The vertices of a PLY in text, a line each.
 
+use nightsplat_core::ply::{PlyHeader, PlyScalar};
 use rayon::prelude::*;
-
-use crate::base::ply::{PlyHeader, PlyScalar};
 
 /// The vertices as a binary little-endian file has them, with zeros for numbers other than floats, which no Gaussian
 /// has. Lines after them are those of other elements.

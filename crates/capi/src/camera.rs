@@ -1,0 +1,115 @@
+//! Cameras: a pinhole's numbers, also from the matrices of an engine.
+
+use glam::{DAffine3, DMat3, DVec2, DVec3};
+use nightsplat_core::camera::{Camera, CameraModel};
+
+use super::error::{Failure, NspResult, guard};
+use super::structs::object_mut;
+
+/// A pinhole camera, in axes x right, y down, z forward.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct NspCamera {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// Focal lengths along x and y in pixels.
+    pub focal: [f64; 2],
+    /// The principal point in pixels, from the top left corner of the image.
+    pub principal_point: [f64; 2],
+    /// The rigid transform from world to view space, three rows of four.
+    pub view_from_world: [f64; 12],
+}
+
+impl From<&NspCamera> for Camera {
+    fn from(camera: &NspCamera) -> Self {
+        let NspCamera { width, height, focal, principal_point, view_from_world: m } = *camera;
+        Self {
+            width,
+            height,
+            focal: DVec2::from(focal),
+            principal_point: DVec2::from(principal_point),
+            model: CameraModel::Pinhole,
+            view_from_world: affine(&m),
+        }
+    }
+}
+
+/// A matrix of three rows of four.
+pub(super) fn affine(m: &[f64; 12]) -> DAffine3 {
+    let column = |c: usize| DVec3::new(m[c], m[4 + c], m[8 + c]);
+    DAffine3 { matrix3: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) }
+}
+
+/// The camera of an engine's column-major view and projection matrices, for Vulkan's clip space (x right, y down,
+/// depth 0 to 1, or reversed). The camera may look along z or -z, with y up or down. `width` and `height` are those of
+/// the viewport in pixels.
+///
+/// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared.
+///
+/// # Safety
+/// `view` and `projection` are NULL or hold 16 floats; `camera` is NULL or valid.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nsp_camera_from_matrices(
+    view: *const f32,
+    projection: *const f32,
+    width: u32,
+    height: u32,
+    camera: *mut NspCamera,
+) -> NspResult {
+    guard("nsp_camera_from_matrices", || {
+        if view.is_null() || projection.is_null() {
+            return Err(Failure::usage("view or projection is NULL"));
+        }
+        // SAFETY: as the caller promises.
+        let (view, projection, camera) = unsafe {
+            let matrix = |m: *const f32| std::slice::from_raw_parts(m, 16);
+            (matrix(view), matrix(projection), object_mut(camera, "camera")?)
+        };
+        *camera = from_matrices(view, projection, [width, height])?;
+        Ok(())
+    })
+}
+
+fn from_matrices(
+    view: &[f32],
+    projection: &[f32],
+    [width, height]: [u32; 2],
+) -> Result<NspCamera, Failure> {
+    if let Some(at) = view.iter().chain(projection).position(|x| !x.is_finite()) {
+        return Err(Failure::usage(format!("number {at} of view and projection is not finite")));
+    }
+    let p = |row: usize, column: usize| f64::from(projection[4 * column + row]);
+    let forward = p(3, 2);
+    if forward == 0.0 || p(3, 3) != 0.0 || p(3, 0) != 0.0 || p(3, 1) != 0.0 {
+        return Err(Failure::usage(
+            "projection is not a perspective; take one whose last row is (0, 0, +-1, 0)",
+        ));
+    }
+    let scale = DVec2::new(p(0, 0), p(1, 1)) / forward.abs();
+    let slack = 1e-6 * scale.abs().max_element();
+    if scale.min_element().abs() == 0.0 || scale.y == 0.0 {
+        return Err(Failure::usage("projection has a focal length of 0"));
+    }
+    let off = [p(0, 1), p(1, 0), p(0, 3), p(1, 3)];
+    if off.iter().any(|x| x.abs() > slack * forward.abs()) {
+        return Err(Failure::usage("projection is sheared or shifted; take one without"));
+    }
+    // The view's axes to x right, y down, z forward.
+    let axes = DVec3::new(scale.x.signum(), scale.y.signum(), forward.signum());
+    let v = |row: usize, column: usize| f64::from(view[4 * column + row]) * axes[row];
+    let half = DVec2::new(f64::from(width), f64::from(height)) / 2.0;
+    let middle = DVec2::new(p(0, 2), p(1, 2)) / forward;
+    let mut view_from_world = [0.0; 12];
+    for (at, value) in view_from_world.iter_mut().enumerate() {
+        *value = v(at / 4, at % 4);
+    }
+    Ok(NspCamera {
+        width,
+        height,
+        focal: (scale.abs() * half).to_array(),
+        principal_point: ((middle + 1.0) * half).to_array(),
+        view_from_world,
+    })
+}

@@ -1,0 +1,373 @@
+//! Renders recorded into a host's command buffers and images.
+
+use ash::vk;
+use ash::vk::Handle as _;
+pub use ash::vk::{
+    AccessFlags2 as VkAccessFlags2, CommandBuffer as VkCommandBuffer, Extent2D as VkExtent2D,
+    Format as VkFormat, Image as VkImage, ImageLayout as VkImageLayout,
+    PipelineStageFlags2 as VkPipelineStageFlags2,
+};
+use nightsplat::gpu::{Gpu, HostFrame, HostImage, ImageFormat, ImageState};
+use nightsplat::splats::render::{
+    DepthConvention, DepthKind, Purpose, RenderOptions, RenderSettings, Renderer, SceneDepth,
+    Target,
+};
+use nightsplat_core::camera::Camera;
+
+use super::camera::NspCamera;
+use super::device::NspDevice;
+use super::error::{Failure, NspResult, Object, guard};
+use super::model::{LoadedModel, NspModel};
+use super::structs::{Sized0, destroy, give, object, object_mut, read, write};
+
+/// A renderer: compiled kernels, and memory that grows with the views. Use it from one thread at a time.
+#[derive(Debug)]
+pub struct NspRenderer(Object<Shown>);
+
+#[derive(Debug)]
+struct Shown {
+    gpu: Gpu,
+    renderer: Renderer,
+    sh_degree: u32,
+    /// Of the model that it was made for.
+    gaussian_count: usize,
+}
+
+/// The state of an image before or after a recording.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct NspImageState {
+    /// The image layout.
+    pub layout: VkImageLayout,
+    /// The queue family that owns the image; `VK_QUEUE_FAMILY_IGNORED`: ownership is not transferred.
+    pub family: u32,
+    /// The pipeline stages in which the host uses the image.
+    pub stages: VkPipelineStageFlags2,
+    /// The host's accesses in these stages.
+    pub access: VkAccessFlags2,
+}
+
+/// An array layer of an image: mip level 0, single-sampled. Its usage includes `TRANSFER_DST` if it is written, and
+/// `TRANSFER_SRC` if it is read.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct NspImage {
+    /// The image.
+    pub image: VkImage,
+    /// Its format.
+    pub format: VkFormat,
+    /// Width and height in pixels, at least those of the cameras.
+    pub extent: VkExtent2D,
+    /// The array layer of the first camera.
+    pub layer: u32,
+    /// The state in which the host leaves the image.
+    pub before: NspImageState,
+    /// The state after the render. If the queue families differ, the library's half of the ownership transfer is
+    /// recorded.
+    pub after: NspImageState,
+}
+
+/// Blends over the contents of `color` instead of replacing them.
+pub const NSP_RENDER_OVER: u32 = 1;
+/// Writes display-referred values, as they were trained, to a float `color` image; otherwise linear light.
+pub const NSP_RENDER_DISPLAY_FLOAT: u32 = 2;
+/// `scene_depth` is reversed: 1 at the near plane, 0 at the far plane.
+pub const NSP_DEPTH_REVERSED: u32 = 4;
+/// `scene_depth` is linear view-space depth in world units.
+pub const NSP_DEPTH_LINEAR: u32 = 8;
+/// `depth_out` is the expected depth, the mean of the splats' depths by their blending weights; otherwise the median
+/// depth, at which the transmittance falls below 1/2.
+pub const NSP_DEPTH_EXPECTED: u32 = 16;
+
+/// Renders the colours of the dark photographs, by inverting the tone law that the model states: linear light in a
+/// linear image, encoded values otherwise. `background` is not changed.
+pub const NSP_RENDER_PHOTOGRAPH: u32 = 32;
+
+const FLAGS: u32 = NSP_RENDER_OVER
+    | NSP_RENDER_DISPLAY_FLOAT
+    | NSP_RENDER_PHOTOGRAPH
+    | NSP_DEPTH_REVERSED
+    | NSP_DEPTH_LINEAR
+    | NSP_DEPTH_EXPECTED;
+
+/// The parameters of a render.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct NspRender {
+    /// `sizeof(NspRender)`.
+    pub struct_size: usize,
+    /// A primary command buffer of the lent queue family, in the recording state, outside a render pass. The host
+    /// submits it once, in the order of recording.
+    pub commands: VkCommandBuffer,
+    /// The value that the host's timeline semaphore reaches when the command buffer is done; it never decreases.
+    pub frame: u64,
+    /// Camera i is drawn into layer `layer + i` of each image.
+    pub cameras: *const NspCamera,
+    /// The number of cameras.
+    pub camera_count: u32,
+    /// `NSP_RENDER_*` and `NSP_DEPTH_*`.
+    pub flags: u32,
+    /// Colour with premultiplied alpha: RGBA16F (linear), or RGBA8 or BGRA8 as UNORM or SRGB; NULL: none.
+    pub color: *const NspImage,
+    /// View-space depth as R32F, infinite where there is no splat; NULL: none.
+    pub depth_out: *const NspImage,
+    /// The host's depth buffer, which occludes splats: D32, D24 or D16 with or without stencil, or R32F; NULL: none.
+    pub scene_depth: *const NspImage,
+    /// The near plane of `scene_depth` in world units.
+    pub scene_near: f32,
+    /// The far plane of `scene_depth` in world units; 0: at infinity.
+    pub scene_far: f32,
+    /// The factor on linear light; 0 stands for 1.
+    pub exposure: f32,
+    /// The background colour, display-referred; not used with `NSP_RENDER_OVER`.
+    pub background: [f32; 3],
+    /// The most intersections of splats and tiles in a view, of which the farthest are left out first; 0: as memory
+    /// allows.
+    pub budget: u32,
+    /// Unused.
+    pub reserved: u32,
+}
+
+// SAFETY: the size comes first; null handles and pointers are zeros.
+unsafe impl Sized0 for NspRender {
+    const NAME: &'static str = "NspRender";
+    const FIRST_SIZE: usize = size_of::<Self>();
+}
+
+/// The outcome of the newest frame that is done.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct NspStatus {
+    /// `sizeof(NspStatus)`.
+    pub struct_size: usize,
+    /// The number of the frame; 0: none is done yet.
+    pub frame: u64,
+    /// Intersections of splats and tiles, in the view that has the most.
+    pub intersections: u32,
+    /// The intersections that memory and budget allowed.
+    pub capacity: u32,
+    /// The intersections that were left out, the farthest.
+    pub left_out: u32,
+    /// The splats of the fullest tile if the device cannot process that many, and the tile is not drawn; else 0.
+    pub splats_per_tile: u32,
+    /// Bytes of device memory in use by all objects of the device.
+    pub device_bytes: u64,
+}
+
+// SAFETY: the size comes first; the rest are numbers.
+unsafe impl Sized0 for NspStatus {
+    const NAME: &'static str = "NspStatus";
+    const FIRST_SIZE: usize = size_of::<Self>();
+}
+
+/// Creates a renderer for models with the SH degree, near plane, colours and tone law of `model`.
+///
+/// # Safety
+/// `device` and `model` are NULL or valid; `renderer` is NULL or valid.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nsp_renderer_create(
+    device: *mut NspDevice,
+    model: *const NspModel,
+    renderer: *mut *mut NspRenderer,
+) -> NspResult {
+    guard("nsp_renderer_create", || {
+        // SAFETY: as the caller promises.
+        unsafe {
+            give(renderer, "renderer", || {
+                let gpu = object(device, "device")?.0.get("the device")?;
+                let LoadedModel { model, on_device } =
+                    object(model, "model")?.0.get("the model")?;
+                check_device(gpu, on_device)?;
+                let settings = RenderSettings { purpose: Purpose::Show, ..model.render_settings() };
+                let renderer = Renderer::new(gpu, settings)?;
+                Ok(NspRenderer(Object::new(Shown {
+                    gpu: gpu.clone(),
+                    renderer,
+                    sh_degree: model.gaussians.shape.sh_degree,
+                    gaussian_count: model.gaussians.count,
+                })))
+            })
+        }
+    })
+}
+
+fn check_device(
+    gpu: &Gpu,
+    on_device: &nightsplat::splats::scene::DeviceGaussians,
+) -> Result<(), Failure> {
+    match on_device.parameters.is_on(gpu) {
+        true => Ok(()),
+        false => Err(Failure::usage("the model is on another device; load it with this one")),
+    }
+}
+
+/// Allocates memory for views of this size and for this many intersections, ahead of the first recording.
+///
+/// # Safety
+/// `renderer` is NULL or valid.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nsp_renderer_reserve(
+    renderer: *mut NspRenderer,
+    width: u32,
+    height: u32,
+    intersections: u32,
+) -> NspResult {
+    guard("nsp_renderer_reserve", || {
+        // SAFETY: as the caller promises.
+        let renderer = unsafe { object_mut(renderer, "renderer")? };
+        renderer.0.with("the renderer", |shown| {
+            shown.renderer.reserve_draw(shown.gaussian_count, [width, height], intersections)?;
+            Ok(())
+        })
+    })
+}
+
+/// Records the render of a model. Nothing is submitted, and nothing is waited for. If the view needs more memory than
+/// there is, the nearest splats are drawn, and a later call allocates more.
+///
+/// It binds compute pipelines, descriptor set 0 and push constants, and restores none of them.
+///
+/// # Safety
+/// `renderer` and `model` are NULL or valid; `render` says the truth.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nsp_record_render(
+    renderer: *mut NspRenderer,
+    model: *const NspModel,
+    render: *const NspRender,
+) -> NspResult {
+    guard("nsp_record_render", || {
+        // SAFETY: as the caller promises.
+        let (renderer, model, render) =
+            unsafe { (object_mut(renderer, "renderer")?, object(model, "model")?, read(render)?) };
+        let loaded = model.0.get("the model")?;
+        // SAFETY: as the caller promises.
+        renderer.0.with("the renderer", |shown| unsafe { record(shown, loaded, &render) })
+    })
+}
+
+/// # Safety
+/// `render` says the truth.
+unsafe fn record(
+    shown: &mut Shown,
+    loaded: &LoadedModel,
+    render: &NspRender,
+) -> Result<(), Failure> {
+    check_device(&shown.gpu, &loaded.on_device)?;
+    if render.commands == vk::CommandBuffer::null() {
+        return Err(Failure::usage("NspRender::commands is NULL"));
+    }
+    if render.flags & !FLAGS != 0 {
+        let flags = render.flags & !FLAGS;
+        return Err(Failure::usage(format!("NspRender::flags has the unknown bits {flags:#x}")));
+    }
+    if render.camera_count == 0 || render.cameras.is_null() {
+        return Err(Failure::usage("NspRender::cameras is NULL or empty"));
+    }
+    // SAFETY: as the caller promises.
+    let (cameras, color, depth, scene) = unsafe {
+        let cameras = std::slice::from_raw_parts(render.cameras, render.camera_count as usize);
+        let image = |image: *const NspImage, name| image.as_ref().map(|image| lent(image, name));
+        (
+            cameras.iter().map(Camera::from).collect::<Vec<_>>(),
+            image(render.color, "NspRender::color").transpose()?,
+            image(render.depth_out, "NspRender::depth_out").transpose()?,
+            image(render.scene_depth, "NspRender::scene_depth").transpose()?,
+        )
+    };
+    let has = |flag: u32| render.flags & flag != 0;
+    let far = Some(render.scene_far).filter(|&far| far != 0.0);
+    let near = render.scene_near;
+    let convention = match (has(NSP_DEPTH_LINEAR), has(NSP_DEPTH_REVERSED)) {
+        (true, _) => DepthConvention::Linear,
+        (false, true) => DepthConvention::Reversed { near, far },
+        (false, false) => DepthConvention::Forward { near, far },
+    };
+    let target = Target {
+        color: color.as_ref(),
+        depth: depth.as_ref(),
+        depth_kind: if has(NSP_DEPTH_EXPECTED) { DepthKind::Expected } else { DepthKind::Median },
+        scene: scene.as_ref().map(|image| SceneDepth { image, convention }),
+        is_over: has(NSP_RENDER_OVER),
+        is_display_referred: has(NSP_RENDER_DISPLAY_FLOAT),
+        is_photograph: has(NSP_RENDER_PHOTOGRAPH),
+        exposure: if render.exposure == 0.0 { 1.0 } else { render.exposure },
+        budget: render.budget,
+    };
+    let options = RenderOptions { sh_degree: shown.sh_degree, background: render.background };
+    let frame = HostFrame { commands: render.commands.as_raw(), number: render.frame, readers: 0 };
+    let Shown { gpu, renderer, .. } = shown;
+    // What can fail does so before anything is recorded.
+    renderer.prepare_draw(&loaded.on_device.layout, &cameras, &target)?;
+    // SAFETY: as the caller promises.
+    unsafe {
+        gpu.record_into(&frame, |pass| {
+            renderer.draw(pass, &loaded.on_device, &cameras, &options, &target)
+        })
+    }?;
+    Ok(())
+}
+
+fn lent(image: &NspImage, name: &str) -> Result<HostImage, Failure> {
+    let format = ImageFormat::from_vulkan(image.format.as_raw()).ok_or_else(|| {
+        Failure::usage(format!(
+            "{name} has format {:?}; take RGBA16F, RGBA8 or BGRA8 (UNORM, SRGB) for color, R32F for depth_out, \
+             D32, D24, D16 or R32F for scene_depth",
+            image.format
+        ))
+    })?;
+    let state = |state: NspImageState| ImageState {
+        layout: state.layout.as_raw(),
+        family: state.family,
+        stages: state.stages.as_raw(),
+        access: state.access.as_raw(),
+    };
+    Ok(HostImage {
+        handle: image.image.as_raw(),
+        format,
+        size: [image.extent.width, image.extent.height],
+        layer: image.layer,
+        before: state(image.before),
+        after: state(image.after),
+    })
+}
+
+/// Writes the outcome of the newest frame that is done to `status`. It never waits.
+///
+/// # Safety
+/// `renderer` and `status` are NULL or valid.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nsp_renderer_status(
+    renderer: *const NspRenderer,
+    status: *mut NspStatus,
+) -> NspResult {
+    guard("nsp_renderer_status", || {
+        // SAFETY: as the caller promises.
+        let Shown { gpu, renderer, .. } =
+            unsafe { object(renderer, "renderer")? }.0.get("the renderer")?;
+        let drawn = renderer.drawn();
+        let of = |member: fn(&nightsplat::splats::render::Drawn) -> u32| {
+            drawn.as_ref().map_or(0, member)
+        };
+        let filled = NspStatus {
+            struct_size: size_of::<NspStatus>(),
+            frame: drawn.map_or(0, |drawn| drawn.frame),
+            intersections: of(|drawn| drawn.intersections),
+            capacity: of(|drawn| drawn.capacity),
+            left_out: of(|drawn| drawn.left_out()),
+            splats_per_tile: of(|drawn| drawn.splats_per_tile),
+            device_bytes: gpu.memory_in_use(),
+        };
+        // SAFETY: as the caller promises.
+        unsafe { write(status, &filled) }
+    })
+}
+
+/// Destroys a renderer; frames that use it may be in flight.
+///
+/// # Safety
+/// `renderer` is NULL or valid, and not used again.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nsp_renderer_destroy(renderer: *mut NspRenderer) {
+    // SAFETY: as the caller promises.
+    unsafe { destroy("nsp_renderer_destroy", renderer) }
+}

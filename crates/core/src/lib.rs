@@ -1,0 +1,28 @@
+//! What all of nightsplat stands on, without Vulkan: errors, files, settings, cameras, images in memory, and the
+//! formulas of tone curves. Part of `nightsplat`, whose API is what it exports of it.
+//!
+//! - [`error`]: errors, sorted by what the user can do about them
+//! - [`input`]: files that users name, read whole
+//! - [`output`]: files that appear when complete
+//! - [`csv`]: tables of comma-separated values
+//! - [`ply`]: headers of PLY files
+//! - [`hash`]: checksums of numbers and bytes
+//! - [`random`]: counter-based random numbers
+//! - [`settings`]: a row for each setting: key, default, rule, unit, help, option
+//! - [`camera`]: cameras and lens distortion
+//! - [`image`]: images in memory
+//! - [`curves`]: the formulas of tone curves
+
+pub mod camera;
+pub mod csv;
+pub mod curves;
+pub mod error;
+pub mod hash;
+pub mod image;
+pub mod input;
+pub mod output;
+pub mod ply;
+pub mod random;
+pub mod settings;
+
+pub use error::{Error, Result, Stop};

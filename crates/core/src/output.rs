@@ -1,0 +1,149 @@
+//! Files that appear when complete, and text that is safe to print.
+
+use std::borrow::Cow;
+use std::path::Path;
+use std::path::PathBuf;
+
+pub use crate::error::one_line;
+use crate::error::{acts, escaped};
+use crate::{Error, Result};
+
+/// Writes a file under a temporary name and renames it when complete.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
+    write_whole_with(path, |path| std::fs::write(path, bytes))
+}
+
+/// [`write_whole`] with a function that writes the file under the given name. The target of a link is replaced, and the
+/// link kept; a device or a pipe is written to, not replaced. What has the temporary name is removed, not followed.
+pub fn write_whole_with(
+    path: &Path,
+    write: impl FnOnce(&Path) -> std::io::Result<()>,
+) -> Result<()> {
+    let failed = |error| {
+        Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
+    };
+    if path.metadata().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
+        return write(path).map_err(failed);
+    }
+    let target = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+    let mut partial = target.as_os_str().to_owned();
+    partial.push(".partial");
+    let partial = Path::new(&partial);
+    let written = remove_link_or_file(partial)
+        .and_then(|()| std::fs::File::create_new(partial).map(drop))
+        .and_then(|()| write(partial))
+        .and_then(|()| std::fs::rename(partial, &target));
+    written.map_err(|error| {
+        // The first failure is the one to report; a remaining temporary file is not.
+        let _ = std::fs::remove_file(partial);
+        failed(error)
+    })
+}
+
+/// The path of a file of ours, such as one of a run, for [`write_whole`]: a link that somebody left there is removed,
+/// and so is a pipe. Links are followed in paths that the user names.
+pub fn own_file(path: PathBuf) -> Result<PathBuf> {
+    let is_usual = path.symlink_metadata().map_or(true, |there| there.is_file() || there.is_dir());
+    if !is_usual {
+        remove_link_or_file(&path)
+            .map_err(|error| Error::output(&path, format!("is in the way ({error}); remove it")))?;
+    }
+    Ok(path)
+}
+
+fn remove_link_or_file(path: &Path) -> std::io::Result<()> {
+    match std::fs::remove_file(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error),
+        _ => Ok(()),
+    }
+}
+
+/// Flushes those of the files that exist, and then their folder, to the disk.
+pub fn flush_to_disk(folder: &Path, files: &[&str]) -> Result<()> {
+    for path in files.iter().map(|file| folder.join(file)).filter(|path| path.is_file()) {
+        // Windows flushes only what may be written.
+        let file = std::fs::File::options().read(true).write(cfg!(windows)).open(&path);
+        file.and_then(|file| file.sync_all()).map_err(|error| {
+            Error::output(&path, format!("cannot be flushed ({error}); check the disk"))
+        })?;
+    }
+    // Not every system can flush a folder.
+    let _ = std::fs::File::open(folder).and_then(|folder| folder.sync_all());
+    Ok(())
+}
+
+/// Creates a folder unless it exists.
+pub fn create_folder(folder: &Path) -> Result<()> {
+    std::fs::create_dir_all(folder)
+        .map_err(|error| Error::output(folder, format!("cannot be created: {error}")))
+}
+
+/// Creates the folder of a file unless it exists.
+pub fn create_folder_of(file: &Path) -> Result<()> {
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
+    folder.map_or(Ok(()), create_folder)
+}
+
+/// Whether two paths name the same file.
+pub fn is_same_file(a: &Path, b: &Path) -> bool {
+    a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
+}
+
+/// Text for a terminal: control characters and those of bidirectional text, which foreign names may contain, are
+/// escaped. Line breaks are kept.
+pub fn printable(text: &str) -> Cow<'_, str> {
+    escaped(text, |c| acts(c) && c != '\n')
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn a_link_and_a_pipe_are_not_replaced() {
+        let folder = tempfile::tempdir().unwrap();
+        let [file, link, pipe] = ["file", "link", "pipe"].map(|name| folder.path().join(name));
+        std::fs::write(&file, "before").unwrap();
+        std::os::unix::fs::symlink(&file, &link).unwrap();
+        write_whole(&link, b"after").unwrap();
+        assert!(link.is_symlink() && std::fs::read(&file).unwrap() == b"after");
+
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let reader = pipe.clone();
+        let reader = std::thread::spawn(move || std::fs::read(reader).unwrap());
+        write_whole(&pipe, b"whole").unwrap();
+        assert!(!pipe.metadata().unwrap().is_file(), "the pipe was replaced");
+        assert_eq!(reader.join().unwrap(), b"whole");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 3);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_planted_link_decides_nothing_about_a_partial_file_or_a_file_of_ours() {
+        let folder = tempfile::tempdir().unwrap();
+        let [file, out, partial] =
+            ["file", "out", "out.partial"].map(|name| folder.path().join(name));
+        std::fs::write(&file, "precious").unwrap();
+        std::os::unix::fs::symlink(&file, &partial).unwrap();
+        write_whole(&out, b"new").unwrap();
+        assert!(!out.is_symlink() && std::fs::read(&out).unwrap() == b"new");
+        std::fs::remove_file(&out).unwrap();
+        std::os::unix::fs::symlink(&file, &out).unwrap();
+        write_whole(&own_file(out.clone()).unwrap(), b"newer").unwrap();
+        assert!(!out.is_symlink() && std::fs::read(&out).unwrap() == b"newer");
+        assert_eq!(std::fs::read(&file).unwrap(), b"precious");
+        // What a killed process left is no obstacle.
+        std::fs::write(&partial, "half").unwrap();
+        write_whole(&out, b"newest").unwrap();
+        assert!(std::fs::read(own_file(out).unwrap()).unwrap() == b"newest" && !partial.exists());
+        flush_to_disk(folder.path(), &["file", "absent"]).unwrap();
+    }
+
+    #[test]
+    fn characters_that_act_on_a_terminal_are_escaped() {
+        assert_eq!(printable("größer\nline"), "größer\nline");
+        assert_eq!(printable("\u{1b}[31mred\r\u{9b}2J\u{7}"), r"\u{1b}[31mred\r\u{9b}2J\u{7}");
+        assert_eq!(one_line("a\nerror: b\u{202e}gnp\u{2069}"), r"a\nerror: b\u{202e}gnp\u{2069}");
+    }
+}

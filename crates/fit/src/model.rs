@@ -1,0 +1,276 @@
+//! A family as a function of its fitted values.
+
+use nightsplat_core::{Error, Result};
+use nightsplat_photographs::tone::{
+    Constant, Curve, Dual, Family, Real, Statistics, ToneSettings, Variable, White, clamped,
+};
+
+use super::{FitOptions, Pair};
+
+/// A setting that is not among a family's constants; it starts at the family's value.
+const fn setting(name: &'static str, low: f64, high: f64) -> Constant {
+    Constant { name, default: low, start: low, bounds: [low, high] }
+}
+const THETA: Constant = setting("theta", 0.05, 1.0);
+const ALPHA: Constant = setting("alpha", 0.0, 0.5);
+const GAIN_C: Constant = setting("gain_c", 0.0, 20.0);
+const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
+
+/// A family with the list of its fitted values.
+#[derive(Clone, Debug)]
+pub(super) struct FitModel {
+    pub(super) family: &'static Family,
+    slots: Vec<Variable>,
+    /// In the order of every vector of values.
+    pub(super) free: Vec<Constant>,
+}
+
+/// The effect of a photograph's exposure on its curve.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ChannelExposure {
+    statistics: Statistics,
+    channel: usize,
+}
+
+impl ChannelExposure {
+    /// For several photographs together: only t matters.
+    pub(super) const POOLED: Self = Self {
+        statistics: Statistics {
+            p10: 1.0,
+            p80: 1.0,
+            p90: 1.0,
+            mean_luminance: 0.0,
+            mean: 1.0,
+            channel_means: [1.0; 3],
+        },
+        channel: 0,
+    };
+
+    pub(super) fn new(statistics: Statistics, channel: usize) -> Self {
+        Self { statistics, channel }
+    }
+
+    pub(super) fn p90(&self) -> f64 {
+        self.statistics.p90.into()
+    }
+}
+
+impl FitModel {
+    pub(super) fn new(family: &'static Family, options: &FitOptions) -> Result<Self> {
+        let mut slots: Vec<Variable> =
+            (0..family.constants.len()).map(Variable::Constant).collect();
+        match family.white {
+            White::One => {}
+            White::P90 if options.adapt || family.alpha > 0.0 || family.gain_c > 0.0 => {
+                slots.extend([Variable::Alpha, Variable::GainC]);
+                if family.is_rescaled {
+                    slots.push(Variable::BaseGain);
+                }
+            }
+            White::P90 => {}
+            White::Mean | White::P80 | White::MeanLuminance | White::ChannelMeans => {
+                slots.push(Variable::Theta);
+            }
+        }
+        if slots.is_empty() {
+            return Err(Error::Usage(format!(
+                "the curve `{}` has no constants to fit",
+                family.name
+            )));
+        }
+        let settings = ToneSettings::new(family.curve);
+        let starting_at =
+            |constant: Constant, value: f64| Constant { default: value, start: value, ..constant };
+        let free = slots.iter().map(|&slot| match slot {
+            Variable::Constant(index) => family.constants[index],
+            Variable::Theta => starting_at(THETA, settings.theta),
+            Variable::Alpha => starting_at(ALPHA, settings.alpha),
+            Variable::GainC => starting_at(GAIN_C, settings.gain_c),
+            Variable::BaseGain => starting_at(BASE_GAIN, settings.base_gain),
+        });
+        Ok(Self { free: free.collect(), family, slots })
+    }
+
+    /// Whether photographs with different statistics have different curves of t.
+    pub(super) fn differs_by_photograph(&self) -> bool {
+        self.slots.iter().any(|slot| !matches!(slot, Variable::Constant(_)))
+    }
+
+    /// Whether the channels of a photograph have different curves.
+    pub(super) fn differs_by_channel(&self) -> bool {
+        self.family.white == White::ChannelMeans
+    }
+
+    /// Whether the shape f has constants; otherwise the curve rises for any black level, white and gain.
+    pub(super) fn has_shape(&self) -> bool {
+        !self.family.constants.is_empty()
+    }
+
+    /// The curve with these values.
+    pub(super) fn settings(&self, values: &[f64]) -> ToneSettings {
+        let mut settings = ToneSettings::new(self.family.curve);
+        for (&slot, &value) in self.slots.iter().zip(values) {
+            match slot {
+                Variable::Constant(index) => settings.constants[index] = value,
+                Variable::Theta => settings.theta = value,
+                Variable::Alpha => settings.alpha = value,
+                Variable::GainC => settings.gain_c = value,
+                Variable::BaseGain => settings.base_gain = value,
+            }
+        }
+        settings
+    }
+
+    /// The curve of a photograph of this exposure with these values.
+    pub(super) fn curve(&self, values: &[f64], exposure: &ChannelExposure) -> CurveOfT<f64> {
+        curve_of(&self.settings(values), exposure, |_, value| value)
+    }
+
+    /// [`Self::curve`] with its derivatives with respect to every value.
+    pub(super) fn slopes(&self, values: &[f64], exposure: &ChannelExposure) -> Slopes {
+        let settings = self.settings(values);
+        let by = |&variable: &Variable| {
+            curve_of(&settings, exposure, |of, value| {
+                let derivative = f64::from(u8::from(of == variable));
+                Dual { value, derivative }
+            })
+        };
+        Slopes(self.slots.iter().map(by).collect())
+    }
+}
+
+/// The curve of a photograph of this exposure, or of one of its channels.
+fn curve_of<T: Real>(
+    settings: &ToneSettings,
+    exposure: &ChannelExposure,
+    number: impl Fn(Variable, f64) -> T,
+) -> CurveOfT<T> {
+    let mut curve = settings.curve_of(&exposure.statistics, number);
+    if settings.white() == White::ChannelMeans {
+        curve.white = curve.constants[exposure.channel];
+    }
+    CurveOfT { p90: exposure.p90(), curve }
+}
+
+/// The curve of a photograph, or of one of its channels, as a function of t = x / p90.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct CurveOfT<T> {
+    p90: f64,
+    curve: Curve<T>,
+}
+
+impl<T: Real> CurveOfT<T> {
+    /// At t, clamped.
+    pub(super) fn at(&self, t: f64) -> T {
+        clamped(self.raw_at(t))
+    }
+
+    /// At t, unclamped.
+    pub(super) fn raw_at(&self, t: f64) -> T {
+        self.curve.at(T::from_f64(t * self.p90))
+    }
+}
+
+/// The derivatives of a curve with respect to every value of its model; those that are not finite count as 0.
+#[derive(Clone, Debug)]
+pub(super) struct Slopes(Vec<CurveOfT<Dual>>);
+
+impl Slopes {
+    /// Of the clamped curve at t.
+    pub(super) fn at(&self, t: f64) -> impl Iterator<Item = f64> {
+        self.0.iter().map(move |curve| counted(curve.at(t)))
+    }
+
+    /// Of the unclamped curve at t.
+    pub(super) fn raw_at(&self, t: f64) -> impl Iterator<Item = f64> {
+        self.0.iter().map(move |curve| counted(curve.raw_at(t)))
+    }
+}
+
+fn counted(number: Dual) -> f64 {
+    if number.derivative.is_finite() { number.derivative } else { 0.0 }
+}
+
+/// The PSNR over all pixels and channels of the dark photograph tone-mapped with `settings`, dB.
+pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
+    let [mut count, mut squares] = [0.0; 2];
+    for (channel, histogram) in pair.channels.iter().enumerate() {
+        let exposure = ChannelExposure::new(pair.statistics, channel);
+        let curve = curve_of(settings, &exposure, |_, value| value);
+        squares += histogram.residuals(|x| curve.at(x / exposure.p90()))[1];
+        count += histogram.count();
+    }
+    -10.0 * (squares.max(0.0) / count).log10()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nightsplat_photographs::tone::{FAMILIES, ToneCurve};
+
+    #[test]
+    fn every_family_agrees_with_the_kernels() {
+        let statistics = Statistics {
+            p10: 0.01,
+            p80: 0.11,
+            p90: 0.13,
+            mean_luminance: 0.06,
+            mean: 0.055,
+            channel_means: [0.05, 0.06, 0.055],
+        };
+        for family in &FAMILIES {
+            let settings = ToneSettings::new(family.curve);
+            let parameters = settings.parameters(&statistics);
+            for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
+                for channel in 0..3 {
+                    let exposure = ChannelExposure::new(statistics, channel);
+                    let curve = curve_of(&settings, &exposure, |_, value| value);
+                    let found = curve.at(x / exposure.p90());
+                    let expected = if family.curve == ToneCurve::PerChannel {
+                        clamped(x as f32 / parameters.constants[channel])
+                    } else {
+                        family.curve.apply(x as f32, &parameters)
+                    };
+                    let error = (found - f64::from(expected)).abs();
+                    assert!(error < 2e-6, "{}({x}): {found}, not {expected}", family.name);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn gradients_agree_with_central_differences() {
+        let statistics = Statistics {
+            p10: 0.02,
+            p80: 0.2,
+            p90: 0.3,
+            mean_luminance: 0.15,
+            mean: 0.14,
+            channel_means: [0.14; 3],
+        };
+        let exposure = ChannelExposure::new(statistics, 1);
+        for family in FAMILIES.iter().filter(|family| family.white != White::One) {
+            let model = FitModel::new(family, &FitOptions { adapt: true, ..FitOptions::default() })
+                .unwrap();
+            let values: Vec<f64> = model.free.iter().map(|constant| constant.start).collect();
+            for t in [0.05, 0.17, 0.61] {
+                for (index, exact) in model.slopes(&values, &exposure).raw_at(t).enumerate() {
+                    let h = 1e-6 * values[index].abs().max(1e-3);
+                    let at = |shift: f64| {
+                        let mut values = values.clone();
+                        values[index] += shift;
+                        model.curve(&values, &exposure).raw_at(t)
+                    };
+                    let difference = (at(h) - at(-h)) / (2.0 * h);
+                    let what = model.free[index].name;
+                    let error = (exact - difference).abs();
+                    assert!(
+                        error < 1e-6 * (1.0 + exact.abs()),
+                        "{} by {what}: {exact}, not {difference}",
+                        family.name
+                    );
+                }
+            }
+        }
+    }
+}

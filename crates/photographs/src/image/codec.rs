@@ -1,0 +1,553 @@
+//! Image files: reads PNG, JPEG, WebP, TIFF and EXR, writes PNG, JPEG and EXR.
+
+use std::io::{BufReader, Cursor};
+use std::path::Path;
+
+use ::image::codecs::{jpeg::JpegEncoder, png::PngEncoder};
+use ::image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader};
+use nightsplat_core::output::write_whole;
+use nightsplat_core::{Error, Result};
+
+use super::colour::ColourCounts;
+#[cfg(not(feature = "raw"))]
+use super::decode::no_raw;
+use super::decode::{PictureFile, decode};
+use super::decoded::{DecodedImage, Meaning};
+use super::files::is_raw;
+use super::levels::Levels;
+use super::source::{BufReadSeek, not_an_image, reader};
+use super::{Image, Orientation, exr_file, jpeg, linear_from_srgb, png_file};
+use crate::tree;
+
+/// The bytes by which a file is told from others.
+const START: u64 = 1 << 16;
+
+/// Whether a file that begins so is read.
+fn is_of_read_format(start: &[u8]) -> bool {
+    let is_webp = start.starts_with(b"RIFF") && start.get(8..12) == Some(b"WEBP");
+    let begins: [&[u8]; 5] = [&jpeg::MAGIC, &png_file::MAGIC, &exr_file::MAGIC, b"II*\0", b"MM\0*"];
+    is_webp || begins.iter().any(|magic| start.starts_with(magic))
+}
+
+impl PictureFile {
+    /// Opens a file and reads its header.
+    pub fn open(path: &Path) -> Result<Self> {
+        #[cfg(debug_assertions)]
+        openings::count(path);
+        // What is no image is refused by its beginning, however long it is.
+        let start = tree::start(path, START).and_then(std::io::Result::ok);
+        let bytes = match start {
+            Some(start) if !is_raw(path) && !is_of_read_format(&start) => start,
+            _ => tree::bytes(path)?,
+        };
+        Ok(Self { path: path.to_owned(), bytes, at: None })
+    }
+
+    /// The file, reduced while it is decoded to the size that `decoded_size` gives for its own.
+    pub fn reduced(mut self, decoded_size: impl Fn((u32, u32)) -> (u32, u32)) -> Self {
+        // What has no readable header is named when it is decoded.
+        let size = self.size().ok();
+        self.at = size.and_then(|size| Some(decoded_size(size)).filter(|at| *at != size));
+        self
+    }
+
+    /// Width and height as it is decoded.
+    pub fn decoded_size(&self) -> Result<(u32, u32)> {
+        self.at.map_or_else(|| self.size(), Ok)
+    }
+
+    /// Width and height, from its header alone.
+    pub fn size(&self) -> Result<(u32, u32)> {
+        if is_raw(&self.path) {
+            return raw_size(&self.path, self.bytes.clone());
+        }
+        if let Some(size) = png_file::size(&self.bytes) {
+            return Ok(size);
+        }
+        let reader = reader(Cursor::new(self.bytes.as_slice()));
+        size_of_reader(&self.path, reader.map_err(|error| unreadable(&self.path, &error))?)
+    }
+
+    /// Whether it holds linear light at these levels.
+    pub fn is_light(&self, levels: &Levels) -> bool {
+        is_raw(&self.path) || self.bytes.starts_with(&exr_file::MAGIC) || levels.are_linear()
+    }
+
+    /// Its Exif orientation.
+    pub fn orientation(&self) -> Orientation {
+        Orientation::read(&mut Cursor::new(self.bytes.as_slice()))
+    }
+
+    /// The photograph in sRGB, and its alpha in all three planes: that of a PNG, WebP or TIFF file, or 0 at values of
+    /// an EXR file that are not finite; `None` if nothing is transparent.
+    pub fn decode(self) -> Result<(Image, Option<Image>)> {
+        self.decode_counted(&ColourCounts::default())
+    }
+
+    /// [`Self::decode`] that counts colour conversions in `counters` instead of logging them.
+    pub fn decode_counted(self, counters: &ColourCounts) -> Result<(Image, Option<Image>)> {
+        let path = self.path.clone();
+        let decoded = decode(self, Meaning::Colour, &counters.levels())?;
+        let DecodedImage { image, alpha, conversion, is_beyond, remark, .. } = decoded;
+        counters.add(&path, conversion, remark, is_beyond);
+        Ok((image, alpha))
+    }
+}
+
+/// Counts how often each file is opened, for tests.
+#[cfg(debug_assertions)]
+pub mod openings {
+    use std::collections::HashMap;
+    use std::path::{Path, PathBuf};
+    use std::sync::{LazyLock, Mutex};
+
+    static COUNTS: LazyLock<Mutex<HashMap<PathBuf, usize>>> = LazyLock::new(Mutex::default);
+
+    pub(super) fn count(path: &Path) {
+        *COUNTS.lock().unwrap().entry(path.to_owned()).or_default() += 1;
+    }
+
+    /// The counts of the files below a folder.
+    pub fn below(folder: &Path) -> Vec<(PathBuf, usize)> {
+        let counts = COUNTS.lock().unwrap();
+        let within = counts.iter().filter(|(path, _)| path.starts_with(folder));
+        within.map(|(path, count)| (path.clone(), *count)).collect()
+    }
+}
+
+fn file_reader(path: &Path) -> Result<ImageReader<Box<dyn BufReadSeek>>> {
+    #[cfg(debug_assertions)]
+    openings::count(path);
+    let opened = tree::open(path).and_then(|file| reader(BufReader::new(file)));
+    opened.map_err(|error| unreadable(path, &error))
+}
+
+fn unreadable(path: &Path, error: &std::io::Error) -> Error {
+    Error::input(path, format!("cannot be read: {error}"))
+}
+
+fn size_of_reader(
+    path: &Path,
+    reader: ImageReader<Box<dyn BufReadSeek + '_>>,
+) -> Result<(u32, u32)> {
+    if reader.format() != Some(ImageFormat::OpenExr) {
+        return reader.into_dimensions().map_err(|error| not_an_image(path, &error));
+    }
+    let meta = exr::meta::MetaData::read_from_buffered(reader.into_inner(), false)
+        .map_err(|error| not_an_image(path, &error))?;
+    let size = meta.headers.first().map(|header| header.layer_size);
+    let size = size.ok_or_else(|| Error::input(path, "this EXR file has no layer"))?;
+    Ok((size.width() as u32, size.height() as u32))
+}
+
+/// Images as files.
+pub trait ImageFile: Sized {
+    /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file in its stored orientation; the content
+    /// determines the format, not the file's name.
+    ///
+    /// Colours are converted to sRGB by the file's ICC profile, the chunks of a PNG, the chromaticities of an EXR, or
+    /// Exif; a profile that cannot be used is named in a warning, and the values count as sRGB. Colours outside sRGB
+    /// are clipped. Alpha is dropped, grey is repeated, and camera RAW (feature `raw`) is linear light. The R, G and B
+    /// (or Y) of an EXR file's first layer are linear light; values that are not finite become 0, with a warning that
+    /// counts them ([`super::Mask::load`] masks them). Light of RAW and EXR keeps its sign: noise at black is negative,
+    /// too.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if the file cannot be read, is truncated or has another format.
+    fn load(path: impl AsRef<Path>) -> Result<Self>;
+
+    /// [`ImageFile::load`] that counts colour conversions in `counters` instead of logging them.
+    #[doc(hidden)]
+    fn load_counted(path: &Path, counters: &ColourCounts) -> Result<Self>;
+
+    /// [`ImageFile::load`] for values that are not colours, such as depth: they are read as stored, including negative ones
+    /// of EXR.
+    #[doc(hidden)]
+    fn load_as_stored(path: impl AsRef<Path>) -> Result<Self>;
+
+    /// [`Self::load_as_stored`], reduced while it is decoded to the size that `decoded_size` gives for its own.
+    #[doc(hidden)]
+    fn load_as_stored_at(
+        path: &Path,
+        decoded_size: impl Fn((u32, u32)) -> (u32, u32),
+    ) -> Result<Self>;
+
+    /// Width and height of an image file, from its header alone.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if the file is not an image.
+    fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)>;
+
+    /// Writes an 8-bit RGB PNG: values clamped to [0, 1], rounded to nearest.
+    ///
+    /// # Errors
+    /// [`Error::Output`] if the file cannot be written; no partial file is left.
+    fn save_png8(&self, path: impl AsRef<Path>) -> Result<()>;
+
+    /// The bytes of the file that [`ImageFile::save_png8`] writes.
+    #[doc(hidden)]
+    fn to_png8(&self) -> Result<Vec<u8>>;
+
+    /// Red, green and blue of every pixel in 8 bits: values clamped to [0, 1], rounded to nearest.
+    #[doc(hidden)]
+    fn to_rgb8(&self) -> Vec<u8>;
+
+    /// A JPEG file of a quality from 1 to 100, values clamped to [0, 1].
+    #[doc(hidden)]
+    fn to_jpeg(&self, quality: u8) -> Result<Vec<u8>>;
+
+    /// Writes a JPEG of high quality, values clamped to [0, 1], with the given Exif segment.
+    #[doc(hidden)]
+    fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()>;
+
+    /// Writes a 16-bit RGB PNG: values clamped to [0, 1], rounded to nearest.
+    ///
+    /// # Errors
+    /// [`Error::Output`] if the file cannot be written; no partial file is left.
+    fn save_png16(&self, path: impl AsRef<Path>) -> Result<()>;
+
+    /// Writes a 32-bit float EXR in linear light, unclamped; [`ImageFile::load`] restores the values up to rounding.
+    ///
+    /// # Errors
+    /// [`Error::Output`] if the file cannot be written; no partial file is left.
+    fn save_exr(&self, path: impl AsRef<Path>) -> Result<()>;
+
+    /// [`ImageFile::save_exr`] with these numbers in the header.
+    #[doc(hidden)]
+    fn save_exr_with(&self, path: impl AsRef<Path>, header: &[(&str, f32)]) -> Result<()>;
+
+    /// [`ImageFile::save_exr`] for values that are not colours, without conversion.
+    #[doc(hidden)]
+    fn save_exr_as_stored(&self, path: impl AsRef<Path>) -> Result<()>;
+}
+
+impl ImageFile for Image {
+    fn load(path: impl AsRef<Path>) -> Result<Self> {
+        let file = PictureFile::open(path.as_ref())?;
+        let path = file.path.clone();
+        let DecodedImage { image, conversion, remark, .. } =
+            decode(file, Meaning::Colour, &Levels::default())?;
+        if let Some(problem) = conversion.unknown {
+            tracing::warn!("{}: {problem} is not used; the colours count as sRGB", path.display());
+        }
+        if let Some(remark) = remark {
+            tracing::warn!("{}: {remark}", path.display());
+        }
+        Ok(image)
+    }
+
+    fn load_counted(path: &Path, counters: &ColourCounts) -> Result<Self> {
+        Ok(PictureFile::open(path)?.decode_counted(counters)?.0)
+    }
+
+    fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
+        Self::load_as_stored_at(path.as_ref(), |size| size)
+    }
+
+    fn load_as_stored_at(
+        path: &Path,
+        decoded_size: impl Fn((u32, u32)) -> (u32, u32),
+    ) -> Result<Self> {
+        let file = PictureFile::open(path)?.reduced(decoded_size);
+        let decoded = decode(file, Meaning::Number, &Levels::default())?;
+        if let Some(remark) = decoded.remark {
+            tracing::warn!("{}: {remark}", path.display());
+        }
+        Ok(decoded.image)
+    }
+
+    fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
+        let path = path.as_ref();
+        if is_raw(path) {
+            return raw_size(path, tree::bytes(path)?);
+        }
+        let start = tree::start(path, START).and_then(std::io::Result::ok);
+        match png_file::size(&start.unwrap_or_default()) {
+            Some(size) => {
+                #[cfg(debug_assertions)]
+                openings::count(path);
+                Ok(size)
+            }
+            None => size_of_reader(path, file_reader(path)?),
+        }
+    }
+
+    fn save_png8(&self, path: impl AsRef<Path>) -> Result<()> {
+        let path = path.as_ref();
+        write_whole(path, &to_png(self, path, &self.to_rgb8(), ExtendedColorType::Rgb8)?)
+    }
+
+    fn to_png8(&self) -> Result<Vec<u8>> {
+        to_png(self, Path::new("a picture"), &self.to_rgb8(), ExtendedColorType::Rgb8)
+    }
+
+    fn to_rgb8(&self) -> Vec<u8> {
+        interleaved(self).map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
+    }
+
+    fn to_jpeg(&self, quality: u8) -> Result<Vec<u8>> {
+        let mut file = Vec::new();
+        JpegEncoder::new_with_quality(&mut file, quality)
+            .write_image(&self.to_rgb8(), self.width, self.height, ExtendedColorType::Rgb8)
+            .map_err(|error| Error::output("a picture", format!("cannot be encoded: {error}")))?;
+        Ok(file)
+    }
+
+    fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()> {
+        const QUALITY: u8 = 97;
+        let file = self.to_jpeg(QUALITY)?;
+        let (start, rest) = file.split_at(jpeg::MAGIC.len());
+        write_whole(path.as_ref(), &[start, exif.unwrap_or_default(), rest].concat())
+    }
+
+    fn save_png16(&self, path: impl AsRef<Path>) -> Result<()> {
+        let samples =
+            interleaved(self).map(|value| (value.clamp(0.0, 1.0) * 65_535.0).round() as u16);
+        let bytes: Vec<u8> = samples.flat_map(u16::to_ne_bytes).collect();
+        let path = path.as_ref();
+        write_whole(path, &to_png(self, path, &bytes, ExtendedColorType::Rgb16)?)
+    }
+
+    fn save_exr(&self, path: impl AsRef<Path>) -> Result<()> {
+        self.save_exr_with(path, &[])
+    }
+
+    fn save_exr_with(&self, path: impl AsRef<Path>, header: &[(&str, f32)]) -> Result<()> {
+        exr_file::save(self, path.as_ref(), linear_from_srgb, header)
+    }
+
+    fn save_exr_as_stored(&self, path: impl AsRef<Path>) -> Result<()> {
+        exr_file::save(self, path.as_ref(), |value| value, &[])
+    }
+}
+
+fn interleaved(image: &Image) -> impl Iterator<Item = f32> + '_ {
+    let pixels = image.pixel_count();
+    (0..pixels).flat_map(move |index| [0, 1, 2].map(|plane| image.data[plane * pixels + index]))
+}
+
+/// The PNG file of these samples; `path` is for errors.
+fn to_png(image: &Image, path: &Path, bytes: &[u8], color: ExtendedColorType) -> Result<Vec<u8>> {
+    let mut file = Vec::new();
+    PngEncoder::new(&mut file)
+        .write_image(bytes, image.width, image.height, color)
+        .map_err(|error| Error::output(path, format!("cannot be encoded: {error}")))?;
+    Ok(file)
+}
+
+#[cfg(feature = "raw")]
+use super::raw::size_of as raw_size;
+
+#[cfg(not(feature = "raw"))]
+fn raw_size(path: &Path, _: Vec<u8>) -> Result<(u32, u32)> {
+    Err(no_raw(path))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use ::image::{ImageBuffer, Luma, LumaA, Rgb, Rgba};
+
+    use super::*;
+    use nightsplat_core::image::testing::{gradient, worst};
+
+    /// A path in a temporary folder, which is removed when the second value is dropped.
+    fn file(name: &str) -> (PathBuf, tempfile::TempDir) {
+        let folder = tempfile::tempdir().unwrap();
+        (folder.path().join(name), folder)
+    }
+
+    #[test]
+    fn every_png_layout_gives_the_same_colours_and_alpha_is_dropped() {
+        let (path, _folder) = file("a.png");
+        let grey = |x: u32, y: u32| (40 * x + 7 * y) as u8;
+        let wide = |x: u32, y: u32| u16::from(grey(x, y)) * 257;
+        let transparent = |grey: u8| Rgba([grey, grey, grey, 0]);
+        let expected = Image::from_fn(5, 3, |x, y| [f32::from(grey(x, y)) / 255.0; 3]);
+        let save: [&dyn Fn() -> ::image::ImageResult<()>; 6] = [
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Luma([grey(x, y)])).save(&path),
+            &|| ImageBuffer::from_fn(5, 3, |x, y| LumaA([grey(x, y), 9])).save(&path),
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Rgb([grey(x, y); 3])).save(&path),
+            &|| ImageBuffer::from_fn(5, 3, |x, y| transparent(grey(x, y))).save(&path),
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Luma([wide(x, y)])).save(&path),
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Rgb([wide(x, y); 3])).save(&path),
+        ];
+        for (layout, save) in save.iter().enumerate() {
+            save().unwrap();
+            assert!(worst(&Image::load(&path).unwrap(), &expected) < 1e-7, "layout {layout}");
+            assert_eq!(Image::size_of(&path).unwrap(), (5, 3));
+        }
+    }
+
+    #[test]
+    fn a_saved_image_is_loaded_to_the_precision_of_its_format() {
+        let image = gradient(7, 5);
+        let (path, _folder) = file("a");
+        image.save_png8(&path).unwrap();
+        assert!(worst(&Image::load(&path).unwrap(), &image) <= 0.5 / 255.0 + 1e-6);
+        image.save_png16(&path).unwrap();
+        assert!(worst(&Image::load(&path).unwrap(), &image) <= 0.5 / 65_535.0 + 1e-6);
+        let bright = |value: &f32| 3.0 * value - 0.5;
+        let bright = Image { data: image.data.iter().map(bright).collect(), ..image };
+        bright.save_exr(&path).unwrap();
+        assert!(worst(&Image::load(&path).unwrap(), &bright) < 1e-5);
+        assert_eq!(Image::size_of(&path).unwrap(), (7, 5));
+    }
+
+    #[test]
+    fn an_exr_is_linear_light_with_its_sign_and_what_is_not_finite_counts_as_black() {
+        let (path, _folder) = file("a.exr");
+        let values = [0.5_f32, 0.001, f32::NAN, f32::INFINITY, -0.5, 4.0];
+        exr::prelude::write_rgb_file(&path, 6, 1, |x, _| (values[x], values[x], values[x]))
+            .unwrap();
+        let loaded = Image::load(&path).unwrap();
+        let expected =
+            [0.735_357, 0.012_92, 0.0, 0.0, -0.735_357, 1.055 * 4.0_f32.powf(1.0 / 2.4) - 0.055];
+        for (x, expected) in expected.into_iter().enumerate() {
+            assert!((loaded.data[x] - expected).abs() < 1e-5, "{}: {}", values[x], loaded.data[x]);
+        }
+    }
+
+    #[test]
+    fn a_grey_exr_is_grey_and_one_without_colour_is_refused() {
+        use exr::prelude::{SpecificChannels, Vec2, WritableImage};
+        let (path, _folder) = file("a.exr");
+        let save = |name: &str| {
+            let channels = SpecificChannels::build().with_channel(name);
+            let channels = channels.with_pixel_fn(|Vec2(x, _): Vec2<usize>| (0.25_f32 * x as f32,));
+            exr::image::Image::from_channels((3, 2), channels).write().to_file(&path).unwrap();
+        };
+        save("Y");
+        let [red, green, blue] = Image::load(&path).unwrap().pixel(2, 1);
+        assert!((red - 0.735_357).abs() < 1e-5 && red == green && green == blue);
+        save("Z");
+        let error = Image::load(&path).unwrap_err().to_string();
+        assert!(error.contains("neither R nor Y, but Z;"), "{error}");
+    }
+
+    #[test]
+    fn the_picture_of_an_exr_with_layers_is_read_where_only_one_can_be_meant() {
+        use exr::prelude::{AnyChannel, AnyChannels, FlatSamples, WritableImage};
+        let (path, _folder) = file("a.exr");
+        let loaded = |groups: &[&str]| {
+            let channel = |(value, name): (usize, String)| {
+                AnyChannel::new(name.as_str(), FlatSamples::F32(vec![value as f32 / 16.0; 6]))
+            };
+            let names =
+                groups.iter().flat_map(|group| ["R", "G", "B"].map(|c| format!("{group}{c}")));
+            let channels = (1..).zip(names).map(channel).collect();
+            let channels = AnyChannels::sort(channels);
+            exr::image::Image::from_channels((3, 2), channels).write().to_file(&path).unwrap();
+            Image::load(&path).map(|image| image.pixel(2, 1).map(linear_from_srgb))
+        };
+        let close = |found: [f32; 3], expected: [f32; 3]| {
+            found.iter().zip(expected).all(|(a, b)| (a - b / 16.0).abs() < 1e-6)
+        };
+        assert!(close(loaded(&["ViewLayer.Combined."]).unwrap(), [1.0, 2.0, 3.0]));
+        assert!(close(loaded(&["A.Diffuse.", "A.Combined."]).unwrap(), [4.0, 5.0, 6.0]));
+        let error = loaded(&["Left.", "Right."]).unwrap_err().to_string();
+        assert!(error.contains("but Left.B, Left.G, Left.R, Right.B"), "{error}");
+    }
+
+    #[test]
+    fn a_file_that_shows_nothing_is_named() {
+        let (path, _folder) = file("a");
+        let remark = |save: &dyn Fn()| {
+            save();
+            let file = PictureFile::open(&path).unwrap();
+            let decoded = decode(file, Meaning::Colour, &Levels::default());
+            decoded.unwrap().remark.unwrap_or_default()
+        };
+        let exr = |value: &dyn Fn(u32) -> f32| {
+            let image = Image::from_fn(4, 1, |x, _| [value(x); 3]);
+            remark(&|| image.save_exr_as_stored(&path).unwrap())
+        };
+        let one = Image::filled(4, 4, [700.0 / 65_535.0; 3]);
+        let sixteen = remark(&|| one.save_png16(&path).unwrap());
+        assert!(sixteen.contains("every value is 700 of 65535"), "{sixteen}");
+        assert_eq!(remark(&|| gradient(4, 4).save_png16(&path).unwrap()), "");
+        assert!(exr(&|_| 0.25).contains("every value is 0.25"));
+        assert!(exr(&|x| -1.0 - x as f32).contains("every value is negative, -1 at most"));
+        assert!(
+            exr(&|x| if x == 1 { f32::NAN } else { x as f32 }).contains("3 values are not finite")
+        );
+        assert_eq!(exr(&|x| x as f32 - 1.0), "");
+    }
+
+    #[test]
+    fn the_error_names_a_file_that_is_not_an_image() {
+        let (path, _folder) = file("noise.png");
+        assert!(Image::load(&path).unwrap_err().to_string().contains("noise.png: cannot be read"));
+        let (exr, _exr_folder) = file("whole.exr");
+        gradient(9, 9).save_exr(&exr).unwrap();
+        let exr = std::fs::read(exr).unwrap();
+        for bytes in [
+            &b""[..],
+            b"not an image",
+            b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR",
+            &exr_file::MAGIC,
+            &exr[..exr.len() / 2],
+        ] {
+            std::fs::write(&path, bytes).unwrap();
+            let error = Image::load(&path).unwrap_err().to_string();
+            assert!(error.contains("noise.png: is not a readable"), "{error}");
+        }
+    }
+
+    #[test]
+    fn images_that_other_programs_convert_name_these() {
+        let (path, _folder) = file("a.png");
+        for (begin, program) in [
+            (&b"\0\0\0\x1cftypheic"[..], "heif-convert"),
+            (b"\0\0\0 ftypavif", "avifdec"),
+            (b"\xff\x0a\xfa\x1f", "djxl"),
+            (b"\0\0\0\x0cJXL \r\n", "djxl"),
+            (b"#?RADIANCE\n", "oiiotool"),
+        ] {
+            std::fs::write(&path, [begin, &[0; 999]].concat()).unwrap();
+            let error = Image::load(&path).unwrap_err().to_string();
+            assert!(error.contains(program) && error.contains("; convert it"), "{error}");
+        }
+    }
+
+    #[test]
+    fn of_a_file_that_is_no_image_only_the_beginning_is_read() {
+        let (path, _folder) = file("a.png");
+        std::fs::File::create(&path).unwrap().set_len(1 << 30).unwrap();
+        let opened = PictureFile::open(&path).unwrap();
+        assert_eq!(opened.bytes.len() as u64, START);
+        let error = opened.decode().unwrap_err().to_string();
+        assert!(error.contains("a.png: is not a readable PNG"), "{error}");
+    }
+
+    #[test]
+    fn a_png_of_sixteen_bits_that_is_interlaced_is_read() {
+        let (path, _folder) = file("a.png");
+        let mut encoder = png::Encoder::new(std::fs::File::create(&path).unwrap(), 1, 1);
+        encoder.set_color(png::ColorType::Grayscale);
+        encoder.set_depth(png::BitDepth::Sixteen);
+        encoder.write_header().unwrap().write_image_data(&[0x12, 0x34]).unwrap();
+        let mut bytes = std::fs::read(&path).unwrap();
+        // A single pixel is the first pass, whole.
+        bytes[28] = 1;
+        let mut crc = flate2::Crc::new();
+        crc.update(&bytes[12..29]);
+        bytes[29..33].copy_from_slice(&crc.sum().to_be_bytes());
+        std::fs::write(&path, bytes).unwrap();
+        let value = Image::load(&path).unwrap().data[0];
+        assert_eq!(value.to_bits(), (f32::from(0x1234_u16) / 65_535.0).to_bits());
+    }
+
+    #[test]
+    fn a_failed_write_leaves_no_file() {
+        let (path, folder) = file("taken");
+        std::fs::create_dir(&path).unwrap();
+        let error = gradient(4, 4).save_png8(&path).unwrap_err();
+        assert!(
+            matches!(&error, Error::Output { .. }) && error.to_string().contains("taken"),
+            "{error}"
+        );
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+}

@@ -1,0 +1,258 @@
+//! The tone of a scene: from the measurements of its photographs to the curve of each.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+
+use crate::image::decoded_at_once;
+use crate::tone::scene_law;
+
+mod recorded;
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use crate::dataset::{Dataset, MeasuredSize, View};
+use crate::image::Image;
+use crate::tone::{
+    Exposure, InverseTone, MeasuredPhotograph, SceneLaw, Statistics, Tone, ToneMapping,
+    ToneSettings, all_black,
+};
+use nightsplat_core::camera::Camera;
+use nightsplat_core::{Error, Result};
+
+/// A curve, with what is measured of the photographs of a scene.
+#[derive(Clone, Debug)]
+pub struct SceneTone {
+    settings: ToneSettings,
+    /// The means over the training photographs, if one curve is used for all.
+    statistics: Option<Statistics>,
+    /// The exposure of the targets, if the curve follows it.
+    pub exposure: Option<Exposure>,
+    /// All training photographs as one.
+    together: MeasuredPhotograph,
+    /// The geometric mean of the gains of the training photographs, if the curve follows the exposure.
+    model_gain: Option<f64>,
+    /// By the name of the view: of each training photograph, or as recorded.
+    mappings: BTreeMap<String, ToneMapping>,
+    /// Whether the mappings are those of a recorded law, and no photograph is measured for its own.
+    is_recorded: bool,
+}
+
+/// The exposure of the targets and of the model.
+#[derive(Clone, Debug, Serialize)]
+pub struct TargetExposure {
+    /// The geometric mean of the views' gains: the exposure at which the model renders and is scored.
+    pub model_gain: f64,
+    /// The exposure of the training photographs together.
+    pub scene: Exposure,
+    /// The gain of every training view, by name.
+    pub gains: BTreeMap<String, f64>,
+}
+
+/// The training views that have a photograph, with their indices in the dataset.
+pub fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &View)> {
+    let views = dataset.views.iter().enumerate();
+    views.filter(|(_, view)| view.is_train() && view.has_photograph())
+}
+
+impl SceneTone {
+    /// A scene of which nothing is measured.
+    pub fn new(settings: &ToneSettings) -> Self {
+        Self {
+            settings: settings.clone(),
+            statistics: None,
+            exposure: None,
+            together: MeasuredPhotograph::default(),
+            model_gain: None,
+            mappings: BTreeMap::new(),
+            is_recorded: false,
+        }
+    }
+
+    /// The scene of these training photographs; `None` if their exposure is needed and all are almost black, or there
+    /// are none.
+    pub fn from_photographs(
+        settings: &ToneSettings,
+        training: &[MeasuredPhotograph],
+    ) -> Option<Self> {
+        let exposure = if settings.takes_exposure() {
+            let luminances = training.iter().map(|one| &one.luminance);
+            let found = Exposure::measure(luminances, settings.brightness)?;
+            let seen = training.iter().map(|one| Some((&one.luminance, one.camera?)));
+            let found = match seen.collect::<Option<Vec<_>>>() {
+                Some(seen) => found.seen_by(seen),
+                None => found,
+            };
+            Some(if settings.scene_statistics { found.shared() } else { found })
+        } else {
+            None
+        };
+        let together = MeasuredPhotograph::together(training);
+        let is_shared = settings.scene_statistics && !training.is_empty();
+        let statistics = is_shared.then_some(together.statistics);
+        Some(Self { statistics, exposure, together, ..Self::new(settings) })
+    }
+
+    /// The scene of a dataset, whose training photographs are measured.
+    pub fn measure(settings: &ToneSettings, dataset: &Dataset) -> Result<Self> {
+        let views: Vec<&View> = photographs(dataset).map(|(_, view)| view).collect();
+        let training = measured(&views, settings.full_resolution)?;
+        if let Some(recorded) = Self::recorded(settings)? {
+            return Ok(Self { together: MeasuredPhotograph::together(&training), ..recorded });
+        }
+        let scene = Self::from_photographs(settings, &training);
+        let mut scene = scene.ok_or_else(|| all_black(&dataset.root))?;
+        for (view, measured) in views.iter().zip(&training) {
+            scene.mappings.insert(view.name.clone(), scene.mapping_of(measured));
+        }
+        scene.model_gain = scene.model_exposure().map(|_| {
+            let gains: Vec<f64> =
+                scene.mappings.values().filter_map(|mapping| mapping.gain.map(f64::ln)).collect();
+            (gains.iter().sum::<f64>() / gains.len().max(1) as f64).exp()
+        });
+        Ok(scene)
+    }
+
+    /// The law of a dataset: with the tone mapping of every test photograph, too.
+    pub fn measure_all(settings: &ToneSettings, dataset: &Dataset) -> Result<Self> {
+        let mut scene = Self::measure(&ToneSettings { law: None, ..settings.clone() }, dataset)?;
+        for view in dataset.views.iter().filter(|view| !view.is_train()) {
+            let mapping = scene.tone_mapping(view)?;
+            scene.mappings.extend(mapping.map(|mapping| (view.name.clone(), mapping)));
+        }
+        Ok(scene)
+    }
+
+    /// The curve and its constants.
+    pub fn settings(&self) -> &ToneSettings {
+        &self.settings
+    }
+
+    /// All training photographs as one.
+    pub fn together(&self) -> &MeasuredPhotograph {
+        &self.together
+    }
+
+    /// The exposure that the model has; a profile determines the brightness of its targets.
+    pub fn model_exposure(&self) -> Option<&Exposure> {
+        self.exposure.as_ref().filter(|_| !matches!(self.settings.curve, Tone::Profile(_)))
+    }
+
+    /// The exposure of the targets of a dataset's training views; `None` if the curve determines it.
+    pub fn target_exposure(&self, dataset: &Dataset) -> Option<TargetExposure> {
+        let gain = |(_, view): (usize, &View)| {
+            Some((view.name.clone(), self.mappings.get(&view.name)?.gain?))
+        };
+        Some(TargetExposure {
+            model_gain: self.model_gain?,
+            scene: self.model_exposure()?.clone(),
+            gains: photographs(dataset).filter_map(gain).collect(),
+        })
+    }
+
+    /// The image from which the target of a view is made: the photograph at full resolution if it is tone-mapped before
+    /// it is resized, else as it was loaded; `None` if the view has no photograph.
+    pub fn source<'a>(&self, view: &'a View) -> Result<Option<Cow<'a, Image>>> {
+        source(view, self.settings.full_resolution)
+    }
+
+    /// The tone mapping of a measured photograph.
+    pub fn mapping_of(&self, photograph: &MeasuredPhotograph) -> ToneMapping {
+        let MeasuredPhotograph { luminance, camera, .. } = photograph;
+        self.mapping_at(photograph, |exposure| exposure.gain_of(luminance, camera.as_ref()))
+    }
+
+    /// The tone mapping of a measured photograph, at this gain if the curve follows the exposure.
+    fn mapping_at(
+        &self,
+        photograph: &MeasuredPhotograph,
+        gain: impl FnOnce(&Exposure) -> f64,
+    ) -> ToneMapping {
+        let statistics = self.statistics.as_ref().unwrap_or(&photograph.statistics);
+        let parameters = self.settings.parameters(statistics);
+        match &self.exposure {
+            None => ToneMapping { parameters, gain: None },
+            Some(exposure) => {
+                let gain = gain(exposure);
+                self.settings.exposed(exposure, parameters, &photograph.luminance, gain)
+            }
+        }
+    }
+
+    /// The tone mapping of a view; `None` without a photograph.
+    pub fn tone_mapping(&self, view: &View) -> Result<Option<ToneMapping>> {
+        if self.is_recorded || self.mappings.contains_key(&view.name) {
+            return self.known(view).map(Some);
+        }
+        let measured = measured_of(view, self.settings.full_resolution)?;
+        Ok(measured.map(|measured| self.mapping_of(&measured)))
+    }
+
+    /// The tone mapping of a view with this photograph.
+    pub fn tone_mapping_of(&self, view: &View, photograph: &Image) -> Result<ToneMapping> {
+        if self.is_recorded {
+            return self.known(view);
+        }
+        let measured = MeasuredPhotograph::measure(&view.counted(photograph)).seen_by(&view.camera);
+        Ok(self.mapping_of(&measured))
+    }
+
+    fn known(&self, View { name, .. }: &View) -> Result<ToneMapping> {
+        let missing =
+            || Error::Usage(format!("the tone law lacks the view {name}; it is another dataset's"));
+        self.mappings.get(name).copied().ok_or_else(missing)
+    }
+
+    /// From the target of a view to its photograph; of a view without one, to what its camera sees.
+    pub fn inverse(&self, view: &View) -> Result<InverseTone> {
+        match self.tone_mapping(view)? {
+            Some(mapping) => InverseTone::new(&self.settings, &mapping.parameters),
+            None => self.inverse_at(&view.camera),
+        }
+    }
+
+    /// The inverse for a camera, at the exposure of the photographs around it: all cameras share one unit of light, as
+    /// far as the photographs share an exposure.
+    pub fn inverse_at(&self, camera: &Camera) -> Result<InverseTone> {
+        let mapping = self.mapping_at(&self.together, |exposure| exposure.gain_around(camera));
+        InverseTone::new(&self.settings, &mapping.parameters)
+    }
+
+    /// The inverse of the whole scene, at the exposure of all photographs together.
+    pub fn inverse_of_scene(&self) -> Result<InverseTone> {
+        InverseTone::new(&self.settings, &self.mapping_of(&self.together).parameters)
+    }
+
+    /// The curve of the whole scene, whose inverse is [`SceneTone::inverse_of_scene`].
+    pub fn law(&self) -> Result<SceneLaw> {
+        scene_law(&self.settings, &self.mapping_of(&self.together).parameters)
+    }
+}
+
+/// Measures the photographs of views that have one.
+fn measured(views: &[&View], full_resolution: bool) -> Result<Vec<MeasuredPhotograph>> {
+    let pixels = |view: &&View| u64::from(view.camera.width) * u64::from(view.camera.height);
+    let largest = views.iter().map(pixels).max().unwrap_or_default();
+    let mut measured = vec![];
+    for views in views.chunks(decoded_at_once(largest)) {
+        let of_views = views.par_iter().map(|view| measured_of(view, full_resolution));
+        measured.extend(of_views.collect::<Result<Vec<_>>>()?.into_iter().flatten());
+    }
+    Ok(measured)
+}
+
+/// The measurements of a view, already known if its photograph was measured while it was decoded.
+fn measured_of(view: &View, full_resolution: bool) -> Result<Option<MeasuredPhotograph>> {
+    let size = if full_resolution { MeasuredSize::Own } else { MeasuredSize::Loaded };
+    let read_anew = view.original.as_ref().filter(|_| full_resolution || view.image.is_none());
+    let measured = match read_anew.and_then(|original| original.measured(size)) {
+        Some(measured) => Some(measured.clone()),
+        None => source(view, full_resolution)?
+            .map(|photograph| MeasuredPhotograph::measure(&view.counted(&photograph))),
+    };
+    Ok(measured.map(|measured| measured.seen_by(&view.camera)))
+}
+
+fn source(view: &View, full_resolution: bool) -> Result<Option<Cow<'_, Image>>> {
+    if full_resolution { view.photograph() } else { view.loaded() }
+}

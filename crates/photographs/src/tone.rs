@@ -1,0 +1,146 @@
+//! Tone curves: from a dark photograph to its pseudo-GT, the target of training.
+//!
+//! Every curve acts on sRGB-encoded values as stored, divided by 255, without linearisation:
+//!
+//! ```text
+//! none    x
+//! linear  x theta / mean(x)
+//! ASE     delta0 + (1 - delta0) (1 - exp(-g t))              g = g0 + c Y
+//! AP3     delta0 + b (0.0720 t^3 - 0.4376 t^2 + 0.9948 t)    b = 1 + c Y
+//! others  delta0 + b f(t)                                    delta0 = 0, b = 1 by default
+//! auto    delta + (1 - delta) [(1 - lambda) s(x) + lambda x s(Y) / Y]    s(x) = 1 - exp(-k x), delta = 0.075
+//! ```
+//!
+//! clamped to [0, 1] for x from 0 on, and T(-x) = 2 T(0) - T(x) below 0, where t = x / p90, Y is the mean luminance,
+//! and the black level delta0 = alpha (1 - p10 / p90)^beta is high if shadows are crushed. The statistics are those of
+//! one photograph, or means over a scene ([`Statistics`]). In the automatic curve, Y is the pixel's luminance, and the
+//! gain k follows from the luminance of all photographs ([`Exposure`]); the gain of every other curve can, too.
+//! [`FAMILIES`] is the table of all curves; a [`Table`] of values from a file and a camera [`Profile`] are curves, too.
+
+mod exposure;
+mod file;
+mod histogram;
+mod inverse;
+mod mapping;
+mod metering;
+mod profile;
+mod settings;
+mod statistics;
+mod table;
+
+use std::fmt;
+use std::str::FromStr;
+
+use nightsplat_core::curves::{CURVE_AUTO, CURVE_PROFILE, CURVE_TABLE, name_of};
+pub use nightsplat_core::curves::{
+    Constant, Constants, Curve, Dual, FAMILIES, Family, Real, SceneLaw, ToneCurve, ToneParameters,
+    Variable, White, bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve,
+};
+use nightsplat_core::{Error, Result};
+
+pub use self::exposure::all_black;
+pub use self::exposure::{Exposure, exposure_knots, is_black};
+pub use self::file::CurveChoice;
+pub use self::histogram::EMPTY_CHANNEL;
+pub use self::histogram::LuminanceHistogram;
+pub use self::inverse::{InverseTone, Inverted, scene_law};
+pub use self::mapping::{MeasuredPhotograph, ToneMapping};
+pub use self::metering::MAX_GAIN;
+pub use self::metering::{CurveEnds, NEAR_WHITE, soft};
+pub use self::profile::{PROFILE_WIDTH, Profile, SEGMENTS, profiled};
+pub use self::settings::OF_CURVE;
+pub use self::settings::{GainChoice, ToneSettings};
+pub use self::statistics::{Statistics, percentiles};
+pub use self::statistics::{luminance, measurable};
+pub use self::table::Table;
+pub use self::table::table_at;
+
+/// What a tone curve is; its name is parsed: `"ase".parse()`.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Tone {
+    /// A formula with constants.
+    Formula(ToneCurve),
+    /// The curve whose gain follows from all photographs: (1 - lambda) soft(x) + lambda x soft(Y) / Y.
+    Auto,
+    /// Values from a file.
+    Table(Table),
+    /// The colours of a camera.
+    Profile(Profile),
+}
+
+impl Tone {
+    /// The names of curves that need a file.
+    const OF_FILES: [&str; 2] = ["table", "profile"];
+
+    /// The formula's row in the table.
+    #[doc(hidden)]
+    pub fn family(&self) -> Option<&'static Family> {
+        match self {
+            Self::Formula(curve) => Some(curve.family()),
+            _ => None,
+        }
+    }
+
+    /// The name on the command line.
+    pub fn name(&self) -> &'static str {
+        name_of(self.constant())
+    }
+
+    /// The number in `include/curves.glsl`: the specialization constant `TONE_CURVE`.
+    #[doc(hidden)]
+    pub fn constant(&self) -> u32 {
+        match self {
+            Self::Formula(curve) => curve.constant(),
+            Self::Auto => CURVE_AUTO,
+            Self::Table(_) => CURVE_TABLE,
+            Self::Profile(_) => CURVE_PROFILE,
+        }
+    }
+
+    /// The curve at the sRGB-encoded value `x`, in the arithmetic of the kernels.
+    #[doc(hidden)]
+    pub fn apply(&self, x: f32, parameters: &ToneParameters) -> f32 {
+        tone_curve(self.constant(), x, parameters)
+    }
+
+    /// Whether the gain of the curve always follows from the photographs.
+    #[doc(hidden)]
+    pub fn is_exposed(&self) -> bool {
+        matches!(self, Self::Auto | Self::Profile(_))
+    }
+}
+
+impl From<ToneCurve> for Tone {
+    fn from(curve: ToneCurve) -> Self {
+        Self::Formula(curve)
+    }
+}
+
+impl PartialEq<ToneCurve> for Tone {
+    fn eq(&self, curve: &ToneCurve) -> bool {
+        matches!(self, Self::Formula(formula) if formula == curve)
+    }
+}
+
+impl fmt::Display for Tone {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl FromStr for Tone {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        match name.to_ascii_lowercase().as_str() {
+            "auto" => Ok(Self::Auto),
+            "table" => Err(Error::Usage(
+                "a table of values is named by its file: FILE.csv or FILE.cube".to_owned(),
+            )),
+            "profile" => Err(Error::Usage(
+                "a camera profile is named by its file: --profile FILE".to_owned(),
+            )),
+            _ => name.parse().map(Self::Formula),
+        }
+    }
+}

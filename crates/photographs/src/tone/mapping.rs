@@ -1,0 +1,228 @@
+//! From the measurements of a photograph to its curve, at a gain that follows from the exposure if it is automatic.
+
+use nightsplat_core::camera::Camera;
+use nightsplat_core::curves::{Constants, Curve, Real, Variable, White, clamped, curve_at, padded};
+
+use super::exposure::Exposure;
+use super::histogram::LuminanceHistogram;
+use super::metering::{CurveEnds, soft, solved};
+use super::{Statistics, Tone, ToneParameters, ToneSettings};
+
+/// The smallest white of linear scaling: it keeps a black photograph black.
+const MIN_WHITE: f64 = 1e-12;
+
+/// Added to a mean that is a divisor.
+const EPSILON: f64 = 1e-6;
+
+/// Minimum and maximum gain of `p80` and `lum_preserve`.
+const GAINS: [f64; 2] = [1.0, 6.0];
+
+/// Minimum and maximum of a solved gain.
+const STRENGTHS: [f64; 2] = [1e-3, 1e4];
+
+/// How a photograph is tone-mapped to its target.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ToneMapping {
+    /// The curve.
+    pub parameters: ToneParameters,
+    /// k of soft(x; k), whose mean luminance the target has, if it follows from the exposure and the photograph is not
+    /// its own target.
+    pub gain: Option<f64>,
+}
+
+/// Measurements of a photograph.
+#[derive(Clone, Debug, Default)]
+pub struct MeasuredPhotograph {
+    /// Percentiles and means.
+    pub statistics: Statistics,
+    /// The histogram of its luminance.
+    pub luminance: LuminanceHistogram,
+    /// Its camera, if known.
+    pub camera: Option<Camera>,
+}
+
+impl MeasuredPhotograph {
+    /// Measures the planes (3, pixels) of a photograph.
+    pub fn measure(planes: &[f32]) -> Self {
+        let (statistics, luminance) = (Statistics::new(planes), LuminanceHistogram::new(planes));
+        Self { statistics, luminance, camera: None }
+    }
+
+    /// All of them as one: the means of the statistics, and the luminance of every pixel.
+    pub fn together(photographs: &[Self]) -> Self {
+        let statistics: Vec<Statistics> = photographs.iter().map(|one| one.statistics).collect();
+        let statistics = Statistics::mean_of(&statistics).unwrap_or_default();
+        let mut luminance = LuminanceHistogram::default();
+        photographs.iter().for_each(|one| luminance.add(&one.luminance));
+        Self { statistics, luminance, camera: None }
+    }
+
+    /// Adds the camera.
+    #[must_use]
+    pub fn seen_by(self, camera: &Camera) -> Self {
+        Self { camera: Some(*camera), ..self }
+    }
+}
+
+impl ToneSettings {
+    /// The curve of a photograph with these statistics; `number` is the value of a setting in the number type.
+    #[doc(hidden)]
+    pub fn curve_of<T: Real>(
+        &self,
+        statistics: &Statistics,
+        number: impl Fn(Variable, f64) -> T,
+    ) -> Curve<T> {
+        let [zero, one, epsilon] = [0.0, 1.0, EPSILON].map(T::from_f64);
+        let measured = |x: f32| T::from_f64(x.into());
+        let mean_luminance = measured(statistics.mean_luminance);
+        let theta = number(Variable::Theta, self.theta);
+        let bounded_gain = |value: T| {
+            (theta / value).at_least(T::from_f64(GAINS[0])).at_most(T::from_f64(GAINS[1]))
+        };
+        let given = padded(&self.constants);
+        let mut constants: Constants<T> =
+            std::array::from_fn(|index| number(Variable::Constant(index), given[index]));
+        let [white, offset, gain] = match self.white() {
+            White::One => [one, zero, one],
+            White::Mean => {
+                let white = measured(statistics.mean) / theta;
+                [white.at_least(T::from_f64(MIN_WHITE)), zero, one]
+            }
+            White::MeanLuminance => [one, zero, bounded_gain(mean_luminance + epsilon)],
+            White::ChannelMeans => {
+                for (white, mean) in constants.iter_mut().zip(statistics.channel_means) {
+                    *white = (measured(mean) + epsilon) / theta;
+                }
+                [one, zero, one]
+            }
+            White::P80 => [one / bounded_gain(measured(statistics.p80)), zero, one],
+            White::P90 => {
+                let is_rescaled = self.curve.family().is_some_and(|family| family.is_rescaled);
+                let least =
+                    if is_rescaled { number(Variable::BaseGain, self.base_gain) } else { one };
+                let alpha = number(Variable::Alpha, self.alpha);
+                [
+                    measured(statistics.p90),
+                    black_level(alpha, self.beta, statistics.ratio()),
+                    least + number(Variable::GainC, self.gain_c) * mean_luminance,
+                ]
+            }
+        };
+        Curve { number: self.curve.constant(), white, offset, gain, constants }
+    }
+
+    /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90. For the automatic curve it is
+    /// alpha.
+    #[doc(hidden)]
+    pub fn offset(&self, ratio: f64) -> f64 {
+        if self.curve == Tone::Auto {
+            self.alpha
+        } else {
+            black_level(self.alpha, self.beta, ratio)
+        }
+    }
+
+    /// The curve of a photograph with these statistics, before an automatic gain.
+    #[doc(hidden)]
+    pub fn parameters(&self, statistics: &Statistics) -> ToneParameters {
+        let Curve { white, offset, gain, mut constants, .. } =
+            self.curve_of(statistics, |_, value| value);
+        let [white, mut offset, gain] = [white, offset, gain].map(|number| number as f32);
+        if self.curve == Tone::Auto {
+            (offset, constants[0]) = (self.alpha as f32, self.colour);
+        }
+        let constants = constants.map(|constant| constant as f32);
+        ToneParameters { white, offset, gain, weight: 1.0, constants }
+    }
+
+    /// The value that t = 1 corresponds to.
+    #[doc(hidden)]
+    pub fn white(&self) -> White {
+        match &self.curve {
+            Tone::Formula(curve) => curve.family().white,
+            Tone::Table(table) if !table.is_of_stored => White::P90,
+            Tone::Table(_) | Tone::Auto | Tone::Profile(_) => White::One,
+        }
+    }
+
+    /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics. A table of three channels, or a
+    /// profile, is evaluated for green, `lum_preserve` and `per_channel` for grey.
+    #[doc(hidden)]
+    pub fn value(&self, t: f64, statistics: &Statistics) -> f64 {
+        let grey = Statistics { channel_means: [statistics.mean; 3], ..*statistics };
+        let ToneParameters { mut white, offset, gain, constants, .. } = self.parameters(&grey);
+        if self.white() == White::ChannelMeans {
+            white = constants[0];
+        }
+        // Without a scene that determines k: a function of k x.
+        let is_of_t = !self.curve.is_exposed();
+        let t = if is_of_t { t * f64::from(statistics.p90) / f64::from(white) } else { t };
+        match &self.curve {
+            Tone::Table(table) => table.value(t, 1),
+            Tone::Profile(profile) => profile.value([t; 3])[1],
+            Tone::Formula(_) | Tone::Auto => {
+                let scale = [offset.into(), gain.into()];
+                let constants = padded(&self.constants);
+                clamped(curve_at(self.curve.constant(), t, scale, &constants))
+            }
+        }
+    }
+
+    /// Statistics for the plain formula of a curve: no black level, gain 1, and t = 1 at its white.
+    #[doc(hidden)]
+    pub fn plain_statistics(&self) -> Statistics {
+        let theta = self.theta as f32;
+        let means = Statistics { mean: theta, channel_means: [theta; 3], ..Statistics::default() };
+        Statistics { p10: 1.0, p80: theta, p90: 1.0, ..means }
+    }
+
+    /// The tone mapping at a gain that follows from the exposure.
+    #[doc(hidden)]
+    pub fn exposed(
+        &self,
+        exposure: &Exposure,
+        parameters: ToneParameters,
+        luminance: &LuminanceHistogram,
+        gain: f64,
+    ) -> ToneMapping {
+        let strength = match self.curve {
+            Tone::Auto | Tone::Profile(_) => gain,
+            _ => self.strength(&parameters, luminance, gain),
+        };
+        let is_lit = exposure.is_lit(luminance);
+        let weight = match self.curve {
+            // A profile applies to bright photographs, too.
+            Tone::Profile(_) => 1.0,
+            _ if is_lit => 0.0,
+            _ => exposure.weight(),
+        };
+        let mut constants = parameters.constants;
+        if self.curve == Tone::Auto {
+            let CurveEnds { shoulder, toe, toe_weight } = exposure.ends;
+            // A blend with the photograph has its black.
+            let toe_weight = if weight < 1.0 { 0.0 } else { toe_weight };
+            // The luminance of one channel keeps no ratios.
+            constants[0] = if luminance.is_one_channel() { 0.0 } else { constants[0] };
+            constants[1..4].copy_from_slice(&[shoulder, toe, toe_weight].map(|end| end as f32));
+        }
+        let (white, weight) = ((1.0 / strength) as f32, weight as f32);
+        let parameters = ToneParameters { white, gain: 1.0, weight, constants, ..parameters };
+        ToneMapping { parameters, gain: Some(gain).filter(|_| !is_lit) }
+    }
+
+    /// The factor on x that gives the curve the mean luminance of soft(x; gain).
+    fn strength(&self, tone: &ToneParameters, luminance: &LuminanceHistogram, gain: f64) -> f64 {
+        let target = luminance.mean_of(|y| soft(y, gain));
+        let (curve, scale) = (self.curve.constant(), [f64::from(tone.offset), 1.0]);
+        let constants = tone.constants.map(f64::from);
+        let mean = |strength: f64| {
+            luminance.mean_of(|y| clamped(curve_at(curve, strength * y, scale, &constants)))
+        };
+        solved(STRENGTHS, |strength| mean(strength) < target)
+    }
+}
+
+/// delta0 = alpha (1 - r)^beta of a photograph with r = p10 / p90; with beta 0 it is alpha for every photograph.
+fn black_level<T: Real>(alpha: T, beta: f64, ratio: f64) -> T {
+    alpha * T::from_f64((1.0 - ratio).powf(beta))
+}

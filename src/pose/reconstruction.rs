@@ -1,0 +1,333 @@
+//! Runs COLMAP on the brightened photographs: features, matches, cameras.
+
+use std::ffi::{OsStr, OsString};
+use std::path::{Path, PathBuf};
+
+use nightsplat_core::output::create_folder;
+use nightsplat_photographs::dataset::Dataset;
+
+use super::pictures::{PosePhotographs, is_dark};
+use super::stages::StageProgress;
+use super::tool::Tool;
+use super::{PoseOptions, PoseProgress, cameras};
+use crate::{Error, Result};
+
+/// The pairs of photographs that COLMAP matches.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Matcher {
+    /// Every pair
+    Exhaustive,
+    /// Neighbours by name
+    Sequential,
+}
+
+impl Matcher {
+    fn command(self) -> &'static str {
+        match self {
+            Self::Exhaustive => "exhaustive_matcher",
+            Self::Sequential => "sequential_matcher",
+        }
+    }
+}
+
+/// The mapper that registers cameras.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Mapper {
+    /// One by one (COLMAP's mapper)
+    Incremental,
+    /// All at once (GLOMAP, or COLMAP from 4.0 on)
+    Global,
+}
+
+/// The programs and files of one reconstruction.
+pub(super) struct Reconstruction<'a> {
+    colmap: Tool<'a>,
+    /// GLOMAP, if it registers the cameras.
+    glomap: Option<Tool<'a>>,
+    options: &'a PoseOptions,
+    /// How many, dark and bright.
+    photographs: usize,
+    matcher: Matcher,
+    /// Whether matching uses the two-view geometry that it found before.
+    is_guided: bool,
+    /// Options of the mapper that relax the choice of the initial pair.
+    relaxed: &'static [(&'static str, &'static str)],
+    /// The user's options: command, name and value.
+    user_options: Vec<(&'static str, String, String)>,
+    work: &'a Path,
+    database: PathBuf,
+    models: PathBuf,
+}
+
+/// The number of dark photographs in the model with the most of them.
+fn placed_in(models: &Path) -> Result<usize> {
+    let largest = Dataset::largest_model(models, is_dark)?;
+    Ok(largest.map_or(0, |(_, placed)| placed.iter().filter(|name| is_dark(name)).count()))
+}
+
+/// Relaxations of the initial pair, for few photographs: a smaller baseline, motion along the viewing direction, and
+/// fewer common features than COLMAP requires by default.
+const RELAXED: [&[(&str, &str)]; 2] = [
+    &[("Mapper.init_min_tri_angle", "6"), ("Mapper.init_min_num_inliers", "50")],
+    &[
+        ("Mapper.init_min_tri_angle", "2"),
+        ("Mapper.init_max_forward_motion", "1"),
+        ("Mapper.init_min_num_inliers", "50"),
+    ],
+];
+
+/// Options with their values.
+type Options = Vec<(String, OsString)>;
+
+impl<'a> Reconstruction<'a> {
+    /// Sets up the folder, and checks that the programs exist.
+    pub(super) fn new(
+        settings: &'a PoseOptions,
+        colmap: Tool<'a>,
+        matcher: Matcher,
+        work: &'a Path,
+    ) -> Result<Self> {
+        let is_global = settings.mapper == Mapper::Global;
+        let needs_glomap = is_global && !colmap.help_contains(&["help"], GLOBAL);
+        let glomap = || colmap.with_same_log(&settings.glomap, "glomap").found("");
+        let glomap = needs_glomap.then(glomap).transpose()?;
+        let (database, models) = (work.join("database.db"), work.join("sparse"));
+        create_folder(&models)?;
+        let mapper = if is_global && !needs_glomap { GLOBAL } else { "mapper" };
+        let commands = ["feature_extractor", matcher.command(), mapper];
+        let mut user_options = vec![];
+        for option in &settings.colmap_options {
+            let (name, value) = option.split_once('=').ok_or_else(|| {
+                Error::Usage(format!("--colmap-option {option} is not NAME=VALUE"))
+            })?;
+            let name = name.trim_start_matches("--");
+            let tool = |command| {
+                if command == mapper { glomap.as_ref().unwrap_or(&colmap) } else { &colmap }
+            };
+            let command =
+                commands.into_iter().find(|command| tool(*command).has_option(command, name));
+            let command = command.ok_or_else(|| {
+                Error::Usage(format!(
+                    "--colmap-option {option}: none of {} has {name}; `colmap mapper -h` lists those of the mapper",
+                    commands.join(", ")
+                ))
+            })?;
+            user_options.push((command, name.to_owned(), value.to_owned()));
+        }
+        Ok(Self {
+            colmap,
+            glomap,
+            options: settings,
+            photographs: 0,
+            matcher,
+            is_guided: false,
+            relaxed: &[],
+            user_options,
+            work,
+            database,
+            models,
+        })
+    }
+
+    /// The folder of the models, each a folder; it is empty if nothing could be reconstructed. If more than a tenth of
+    /// the dark photographs have no camera, all are matched again, guided: without it, the result of a small set
+    /// depends on chance; always matching guided would double the time of a large one. If most still have none, the
+    /// choice of the initial pair is relaxed.
+    pub(super) fn models(
+        mut self,
+        pictures: &PosePhotographs,
+        report: &dyn Fn(PoseProgress<'_>),
+    ) -> Result<PathBuf> {
+        let copies = pictures.copies.as_path();
+        self.photographs = pictures.dark.len() + pictures.bright.len();
+        self.extract(pictures, report)?;
+        // COLMAP matches no pair twice: matching again begins with the features alone.
+        let features = self.work.join("guided.db");
+        if self.database.is_file() {
+            std::fs::copy(&self.database, &features)
+                .map_err(|error| Error::output(&features, format!("cannot be written: {error}")))?;
+        }
+        self.match_features(report)?;
+        self.register(copies, report)?;
+        let all = pictures.dark.len();
+        let mut placed = placed_in(&self.models)?;
+        let mut best = self.models.clone();
+        if 10 * placed >= 9 * all {
+            return Ok(best);
+        }
+        let line = format!("{placed} of {all} have a camera: matching again, guided");
+        report(PoseProgress::Line(&line));
+        self.is_guided = true;
+        self.use_folder("guided")?;
+        self.database = features;
+        match self.match_features(report).and_then(|()| self.register(copies, report)) {
+            // The models of the first attempt are still there.
+            Err(error) if placed > 0 => {
+                tracing::warn!("{error}; using the cameras of the first attempt");
+                return Ok(best);
+            }
+            outcome => outcome?,
+        }
+        for (step, relaxed) in [&[][..]].into_iter().chain(RELAXED).enumerate() {
+            if !relaxed.is_empty() {
+                if 2 * placed >= all || self.options.mapper == Mapper::Global {
+                    break;
+                }
+                let line = format!(
+                    "{placed} of {all} have a camera: registering again, from a closer pair"
+                );
+                report(PoseProgress::Line(&line));
+                self.relaxed = relaxed;
+                self.use_folder(&format!("relaxed{step}"))?;
+                self.register(copies, report)?;
+            }
+            let found = placed_in(&self.models)?;
+            if found > placed {
+                (placed, best) = (found, self.models.clone());
+            }
+        }
+        Ok(best)
+    }
+
+    /// Writes models into another folder from now on.
+    fn use_folder(&mut self, name: &str) -> Result<()> {
+        self.models = self.work.join(name);
+        create_folder(&self.models)
+    }
+
+    /// Extracts the features of each photograph. Those of one group share a camera.
+    fn extract(&self, pictures: &PosePhotographs, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
+        let command = "feature_extractor";
+        let photographs = pictures.all();
+        let groups = cameras::groups(&photographs);
+        let (shared, single): (Vec<_>, Vec<_>) =
+            groups.into_iter().partition(|group| group.len() > 1);
+        let single: Vec<&Path> = single.concat();
+        let mut runs: Vec<(Vec<&Path>, &str)> =
+            shared.into_iter().map(|group| (group, "1")).collect();
+        if !single.is_empty() {
+            runs.push((single, "0"));
+        }
+        let use_gpu = self.named(command, ["FeatureExtraction", "SiftExtraction"], "use_gpu");
+        for (at, (group, is_one_camera)) in runs.iter().enumerate() {
+            let mut options = self.files(&pictures.copies);
+            options.extend([
+                ("ImageReader.single_camera".to_owned(), (*is_one_camera).into()),
+                ("ImageReader.camera_model".to_owned(), self.options.camera_model.as_str().into()),
+                (use_gpu.clone(), self.gpu().into()),
+            ]);
+            if pictures.masks.is_dir() {
+                options.push(("ImageReader.mask_path".to_owned(), pictures.masks.clone().into()));
+            }
+            if runs.len() > 1 {
+                let list = self.work.join(format!("camera{at}.txt"));
+                let names = group.iter().map(|path| pictures.name(path)).collect::<Vec<_>>();
+                std::fs::write(&list, names.join("\n") + "\n")
+                    .map_err(|error| Error::output(&list, format!("cannot be written: {error}")))?;
+                options.push(("image_list_path".to_owned(), list.into()));
+            }
+            self.run(&self.colmap, command, options, "features", report)?;
+        }
+        report(PoseProgress::Line(&match runs.len() {
+            1 => "features extracted".to_owned(),
+            count => format!(
+                "features extracted; {count} groups of photographs by size, lens and focal length"
+            ),
+        }));
+        Ok(())
+    }
+
+    fn match_features(&self, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
+        let command = self.matcher.command();
+        let of_matching = |option| self.named(command, ["FeatureMatching", "SiftMatching"], option);
+        let mut options = vec![("database_path".to_owned(), self.database.clone().into())];
+        options.push((of_matching("use_gpu"), self.gpu().into()));
+        // With the relative pose of two photographs, more of their features are matched.
+        if self.is_guided {
+            options.push((of_matching("guided_matching"), "1".into()));
+        }
+        if self.matcher == Matcher::Exhaustive {
+            // COLMAP reports its progress block by block.
+            let block = (self.photographs / 6).clamp(4, 50);
+            options.push(("ExhaustiveMatching.block_size".to_owned(), block.to_string().into()));
+        }
+        self.run(&self.colmap, command, options, "matching", report)?;
+        report(PoseProgress::Line("features matched"));
+        Ok(())
+    }
+
+    fn register(&self, tone_mapped: &Path, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
+        let mut files = self.files(tone_mapped);
+        files.push(("output_path".to_owned(), self.models.clone().into()));
+        let run = |tool, command, files| self.run(tool, command, files, "registering", report);
+        let registered = match (self.options.mapper, &self.glomap) {
+            (Mapper::Incremental, _) => {
+                let relaxed = self.relaxed.iter();
+                files.extend(relaxed.map(|(name, value)| ((*name).to_owned(), (*value).into())));
+                run(&self.colmap, "mapper", files)
+            }
+            (Mapper::Global, Some(glomap)) => run(glomap, "mapper", files),
+            (Mapper::Global, None) => {
+                // Global registration requires focal lengths.
+                let (command, database) = ("view_graph_calibrator", files[..1].to_vec());
+                let calibrated = self.run(&self.colmap, command, database, "calibrating", report);
+                calibrated.and_then(|()| run(&self.colmap, GLOBAL, files))
+            }
+        };
+        // COLMAP fails without an initial pair; the error then names the photographs.
+        match registered {
+            Err(_) if NO_INITIAL_PAIR.iter().any(|words| self.colmap.printed(words)) => {}
+            outcome => outcome?,
+        }
+        report(PoseProgress::Line("cameras placed"));
+        Ok(())
+    }
+
+    /// Runs a command and reports its progress. The user's options override `options`.
+    fn run(
+        &self,
+        tool: &Tool<'_>,
+        command: &str,
+        mut options: Options,
+        what: &str,
+        report: &dyn Fn(PoseProgress<'_>),
+    ) -> Result<()> {
+        for (_, name, value) in self.user_options.iter().filter(|(of, ..)| *of == command) {
+            options.retain(|(option, _)| option != name);
+            options.push((name.clone(), value.into()));
+        }
+        let options: Vec<[OsString; 2]> =
+            options.into_iter().map(|(name, value)| [format!("--{name}").into(), value]).collect();
+        let arguments: Vec<&OsStr> = options.iter().flatten().map(OsString::as_os_str).collect();
+        let mut stage = StageProgress::new(what, self.photographs);
+        tool.run(command, &arguments, |printed| {
+            if let Some(line) = stage.due(printed) {
+                report(PoseProgress::Line(&line));
+            }
+        })
+    }
+
+    fn files(&self, tone_mapped: &Path) -> Options {
+        vec![
+            ("database_path".to_owned(), self.database.clone().into()),
+            ("image_path".to_owned(), tone_mapped.into()),
+        ]
+    }
+
+    /// The name of an option in this version of COLMAP; its group changed in 3.12.
+    fn named(&self, command: &str, [new, old]: [&str; 2], option: &str) -> String {
+        let name = format!("{new}.{option}");
+        if self.colmap.has_option(command, &name) { name } else { format!("{old}.{option}") }
+    }
+
+    fn gpu(&self) -> &'static str {
+        if self.options.colmap_gpu { "1" } else { "0" }
+    }
+}
+
+/// GLOMAP's command in COLMAP from 4.0 on.
+const GLOBAL: &str = "global_mapper";
+
+/// Messages of a mapper that found no initial pair.
+const NO_INITIAL_PAIR: [&str; 2] =
+    ["No good initial image pair found", "failed to create sparse model"];
