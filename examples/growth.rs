@@ -10,7 +10,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use nightsplat::cli::bench::scene::{self, BenchScene};
+use nightsplat::bench::scene::{self, BenchScene};
 use nightsplat::gpu::{DeviceChoice, Gpu, PassTime};
 use nightsplat::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::{Features, MAX_SH_DEGREE, Shape};

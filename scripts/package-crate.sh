@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Packs the crates as dist/*.crate, with their checksums. That of the root has the kernels compiled: without the feature
 # `glslang`, it builds without a C++ compiler. The kernels stay in precompiled/ for `cargo publish --workspace
-# --allow-dirty`: git ignores that folder, which cargo treats as uncommitted. Builds the packages once in this way, on
-# one core, and prints the processor time. Option --allow-dirty also packs uncommitted changes.
+# --allow-dirty`: git ignores that folder, which cargo treats as uncommitted. Builds the packages once in this way,
+# and prints the processor time. Option --allow-dirty also packs uncommitted changes.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$PWD/target} CARGO_INCREMENTAL=0
@@ -43,7 +43,7 @@ if cargo tree --offline --locked --no-default-features --edges normal,build --pr
 fi
 
 TIMEFORMAT="packed, and built without C++ in %U s of processor time and %S s of the system's"
-time cargo package --quiet --workspace --locked --offline --allow-dirty --no-default-features --jobs 1
+time cargo package --quiet --workspace --locked --offline --allow-dirty --no-default-features
 mkdir -p dist
 cp "$CARGO_TARGET_DIR"/package/nightsplat*.crate dist/
 cd dist

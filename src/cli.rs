@@ -13,6 +13,9 @@ use nightsplat_photographs::image::{Image, ImageFile};
 use tracing::field::Field;
 use tracing_subscriber::fmt::format::Writer;
 
+use crate::driver;
+use crate::gpu::DeviceChoice;
+use crate::results::finished_run::Opener;
 use crate::train::settings::setting;
 
 pub mod bench;
@@ -24,13 +27,11 @@ pub mod completions;
 pub mod demo;
 pub mod diagnose;
 pub mod doctor;
-mod driver;
 pub mod edit;
 pub mod eval;
 pub mod export;
 mod help;
 mod hints;
-pub mod live;
 pub mod man;
 mod phases;
 pub mod pose;
@@ -40,7 +41,6 @@ mod settings;
 mod signals;
 pub mod sweep;
 pub mod synth;
-mod table;
 mod tell;
 pub mod tone;
 pub mod train;
@@ -235,6 +235,11 @@ impl OutputFormat {
 fn progress_bar(len: usize) -> ProgressBar {
     let style = ProgressStyle::with_template("{bar:32} {pos}/{len}  {msg}  {eta} left");
     ProgressBar::new(len as u64).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+/// How a command opens the device of a run: the chosen one, or that of its configuration.
+fn opener(device: Option<&DeviceChoice>) -> Opener {
+    Opener { device: device.cloned(), open: driver::open }
 }
 
 #[cfg(test)]

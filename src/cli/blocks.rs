@@ -7,13 +7,15 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 use clap::Subcommand;
 use nightsplat_core::output::printable;
+use nightsplat_core::table::aligned;
 use nightsplat_photographs::tree::check_writable;
 
 use self::work::work;
 use super::train::TrainOptions;
-use super::{driver, finish, print, table, tell, word};
+use super::{finish, print, tell, word};
 use crate::Error;
 use crate::blocks::{self, BlockPlan, MAX_ROUNDS, PlanRow, Request};
+use crate::driver;
 use crate::gpu::DeviceChoice;
 use crate::train::{CacheSize, PlanSource};
 
@@ -166,8 +168,7 @@ fn summary(plan: &BlockPlan) -> String {
     let head = ["block", "views", "points", "Gaussians", "steps", "MiB", "MiB on disk"];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     rows.extend(std::iter::once(&plan.file.coarse).chain(&plan.file.blocks).map(row));
-    let (table, count, percent) =
-        (table::aligned(&rows), plan.file.round(1).count(), 100.0 * plan.shared);
+    let (table, count, percent) = (aligned(&rows), plan.file.round(1).count(), 100.0 * plan.shared);
     format!("{table}{count} blocks, each with {percent:.0} % of the views on average\n")
 }
 

@@ -3,11 +3,13 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
+use nightsplat_core::table::aligned;
 use nightsplat_photographs::dataset::Dataset;
 use serde_json::{Value, json};
 
 use super::train::TrainOptions;
-use super::{driver, finish, print, table, word};
+use super::{finish, print, word};
+use crate::driver;
 use crate::gpu::{CheckReport, CheckedPass, DeviceChoice, Gpu};
 use crate::train::Trainer;
 
@@ -91,5 +93,5 @@ fn as_text(gpu: &Gpu, report: &CheckReport) -> String {
         None => format!("{passes} passes agree with their references"),
         Some(first) => format!("the first difference is in {first}"),
     };
-    format!("{}, {}\n\n{}\n{verdict}\n", properties.name, properties.driver, table::aligned(&rows))
+    format!("{}, {}\n\n{}\n{verdict}\n", properties.name, properties.driver, aligned(&rows))
 }

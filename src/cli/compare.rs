@@ -7,7 +7,7 @@ use nightsplat_core::output::{one_line, write_whole};
 use nightsplat_photographs::tree::check_writable;
 
 use super::eval::LpipsRange;
-use super::{driver, finish, print, table, word};
+use super::{finish, opener, print, word};
 use crate::Error;
 use crate::gpu::DeviceChoice;
 use crate::results::comparison::{CompareOptions, RunComparison};
@@ -56,7 +56,7 @@ pub fn run(args: &CompareArgs) -> Result<()> {
     args.report.iter().try_for_each(|path| check_writable(path))?;
     let options = CompareOptions {
         dataset: args.dataset.as_deref(),
-        opener: driver::opener(args.device.as_ref()),
+        opener: opener(args.device.as_ref()),
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),
         with_pictures: args.report.is_some(),
     };
@@ -69,8 +69,7 @@ pub fn run(args: &CompareArgs) -> Result<()> {
     if args.json {
         return Ok(print(format_args!("{:#}", comparison.json()))?);
     }
-    let tables = [comparison.means(), comparison.views()]
-        .map(|table_of_scores| table::text(&table_of_scores));
+    let tables = [comparison.means(), comparison.views()].map(|scores| scores.text());
     print(tables.join("\n") + "\n")?;
     for [key, values] in comparison.settings() {
         print(one_line(&format!("{key}: {values}")))?;

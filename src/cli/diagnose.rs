@@ -10,8 +10,9 @@ use nightsplat_photographs::tree::check_writable;
 use serde::Serialize;
 
 use super::settings::{Selection, SettingOptions, push_dataset};
-use super::{driver, finish, print, table, word, words};
+use super::{finish, opener, print, word, words};
 use crate::Error;
+use crate::driver;
 use crate::gpu::DeviceChoice;
 use crate::results::diagnosis;
 use crate::results::eval::{ResidualTransmittance, hole_warning};
@@ -134,7 +135,7 @@ fn holes(
     args: &DiagnoseArgs,
 ) -> Result<(String, BTreeMap<String, ResidualTransmittance>)> {
     let FinishedRun { config, dataset, mut model_renderer, .. } =
-        FinishedRun::open(run, Some(&args.dataset), &driver::opener(args.device.as_ref()))?;
+        FinishedRun::open(run, Some(&args.dataset), &opener(args.device.as_ref()))?;
     let mut found = BTreeMap::new();
     for view in &dataset.views {
         let residual_transmittance =
@@ -163,7 +164,7 @@ fn text(device: &str, dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> 
         diagnosis::sizes(views),
         dataset.points.len()
     );
-    text += &table::text(&diagnosis::table(diagnosis));
+    text += &diagnosis::table(diagnosis).text();
     text.push('\n');
     for [name, figures] in diagnosis::scene_facts(&diagnosis.scene) {
         text += &format!("{name:<12}{figures}\n");

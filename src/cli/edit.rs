@@ -9,7 +9,7 @@ use nightsplat_core::output::one_line;
 use nightsplat_photographs::tree::check_writable;
 
 use self::operations::Operations;
-use super::{driver, finish, tell, word};
+use super::{finish, opener, tell, word};
 use crate::Error;
 use crate::gpu::DeviceChoice;
 use crate::results::edit::{EditList, Editor};
@@ -63,7 +63,7 @@ pub fn run(args: &EditArgs) -> Result<()> {
     Editor::check_output(&args.model, &args.out)?;
     args.save_edits.iter().try_for_each(|path| check_writable(path))?;
     let mut editor =
-        Editor::open(&args.model, args.dataset.as_deref(), driver::opener(args.device.as_ref()))?;
+        Editor::open(&args.model, args.dataset.as_deref(), opener(args.device.as_ref()))?;
     if let (Some(list), Some(path)) = (&list, &args.edits) {
         editor.check_list(path, list)?;
     }

@@ -8,7 +8,7 @@ use nightsplat_core::output::{one_line, write_whole};
 use nightsplat_photographs::dataset::DOWNSCALE;
 use nightsplat_photographs::tree::check_writable;
 
-use super::{driver, finish, print, progress_bar, table, word};
+use super::{finish, opener, print, progress_bar, word};
 use crate::Error;
 use crate::gpu::DeviceChoice;
 use crate::networks::lpips::Range;
@@ -99,7 +99,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         dataset: args.dataset.as_deref(),
         reference: args.reference.as_deref(),
         downscale: args.downscale,
-        opener: driver::opener(args.device.as_ref()),
+        opener: opener(args.device.as_ref()),
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),
         align: args.align,
         photographs: args.photographs,
@@ -120,7 +120,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     if args.json {
         return Ok(print(format_args!("{:#}", scored.json()))?);
     }
-    print(table::text(&scored.evaluation.table()))?;
+    print(scored.evaluation.table().text())?;
     scored.notes().iter().try_for_each(|note| print(one_line(note)))?;
     let wrote = args.report.iter().chain(&images).map(|path| path.display().to_string());
     let next = format!("nightsplat render {} --split all --out pictures", word(&args.run));

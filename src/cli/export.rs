@@ -6,7 +6,7 @@ use anyhow::Result;
 use nightsplat_core::camera::frame::relative_to;
 use nightsplat_photographs::tree::check_writable;
 
-use super::{driver, finish, word, words};
+use super::{finish, opener, word, words};
 use crate::Error;
 use crate::gpu::DeviceChoice;
 use crate::results::export::streamed::{self, Division, MAX_LEVELS, Written};
@@ -98,7 +98,7 @@ pub(super) fn write(args: &ExportArgs) -> crate::Result<Exported> {
         division: Division { levels: args.levels, chunk: args.chunk },
         views: args.views,
         dataset: args.dataset.as_deref(),
-        opener: driver::opener(args.device.as_ref()),
+        opener: opener(args.device.as_ref()),
     };
     options.write()
 }

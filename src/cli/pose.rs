@@ -8,7 +8,8 @@ use anyhow::Result;
 use indicatif::ProgressBar;
 use nightsplat_photographs::image::StoredLight;
 
-use super::{driver, finish, progress_bar, tell_on_stderr, word};
+use super::{finish, progress_bar, tell_on_stderr, word};
+use crate::driver;
 use crate::gpu::DeviceChoice;
 use crate::pose::{Mapper, Matcher, PoseOptions, PoseProgress, Posed, describe, estimate};
 

@@ -10,7 +10,7 @@ mod shots;
 
 use self::shots::{Shot, shots};
 use super::words::NamedValues;
-use super::{OutputFormat, driver, finish, progress_bar, word};
+use super::{OutputFormat, finish, opener, progress_bar, word};
 use crate::Error;
 use crate::gpu::DeviceChoice;
 use crate::results::colour_map;
@@ -279,7 +279,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     }
     args.video.iter().chain([out]).try_for_each(|path| check_writable(path))?;
     let FinishedRun { config, dataset, mut model_renderer, lamp, .. } =
-        FinishedRun::open(run, args.dataset.as_deref(), &driver::opener(device.as_ref()))?;
+        FinishedRun::open(run, args.dataset.as_deref(), &opener(device.as_ref()))?;
     if args.lamp {
         let missing = || {
             let problem =

@@ -43,8 +43,9 @@ pub(super) use self::run::parsed;
 use self::run::{Run, absolute, difference};
 use self::runner::FailedPoint;
 use super::eval::LpipsRange;
-use super::{driver, finish, print, progress_bar, tell};
+use super::{finish, print, progress_bar, tell};
 use crate::Error;
+use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::train::{Part, TrainConfig, diagnosed};
 
@@ -190,7 +191,7 @@ fn swept(
     if args.json {
         print(format_args!("{:#}", rows.json(&dataset.root, &failures)))?;
     } else {
-        let tables = [leaderboard.table(), rows.costs()].map(|table| super::table::text(&table));
+        let tables = [leaderboard.table(), rows.costs()].map(|table| table.text());
         tell(tables.join("\n") + "\n");
         let out = args.out.display();
         finish(&format!("{out}/index.html, {out}/costs.html"), &format!("open {out}/index.html"));

@@ -8,9 +8,10 @@ use glam::{DAffine3, DVec3, Vec3};
 use nightsplat_core::camera::Camera;
 use nightsplat_photographs::dataset::Dataset;
 
-use super::live::{DEFAULT_ADDRESS, Feed, Listen, Pictures, Server, Site};
-use super::{driver, tell_on_stderr};
+use super::tell_on_stderr;
+use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
+use crate::live::{DEFAULT_ADDRESS, Feed, Listen, Pictures, Server, Site};
 use crate::results::export::Provenance;
 use crate::results::export::page::{Bookmark, ModelPage};
 use crate::results::finished_run::{config_of_file, is_model};

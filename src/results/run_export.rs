@@ -11,7 +11,8 @@ use nightsplat_core::output::{create_folder_of, is_same_file, own_file, write_wh
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::scene_tone::SceneTone;
 
-use self::up::{Turn, Up};
+use self::up::Turn;
+pub use self::up::Up;
 use crate::results::export::streamed::{self, Division, TileLoader, Written};
 use crate::results::export::{Format, Provenance};
 use crate::results::finished_run::{Opener, config_of_file, is_model, needs_photographs};

@@ -4,8 +4,9 @@
 //! stored photograph, parameters -> pseudo_gt -> target
 //! ```
 //!
-//! The host derives the parameters from the statistics of the photograph ([`SceneTone`](nightsplat_photographs::scene_tone::SceneTone)). A photograph
-//! beyond the device's limits is processed in tiles.
+//! The host derives the parameters from the statistics of the photograph
+//! ([`SceneTone`](nightsplat_photographs::scene_tone::SceneTone)). A photograph beyond the device's limits is processed
+//! in tiles.
 
 mod encoded;
 mod photographs;
@@ -25,7 +26,7 @@ const _: () = {
     assert!(tone::SEGMENTS == kernels::pseudo_gt::SEGMENTS);
     assert!(tone::PROFILE_WIDTH == kernels::pseudo_gt::PROFILE_WIDTH);
     assert!(curves::MAX_CONSTANTS == kernels::curves::MAX_CONSTANTS as usize);
-    assert!(curves::LARGEST_T == kernels::curves::LARGEST_T);
+    assert!(curves::LARGEST_T.to_bits() == kernels::curves::LARGEST_T.to_bits());
     assert!(curves::CURVE_TABLE == kernels::curves::CURVE_TABLE);
     assert!(curves::CURVE_AUTO == kernels::curves::CURVE_AUTO);
     assert!(curves::CURVE_PROFILE == kernels::curves::CURVE_PROFILE);

@@ -3,8 +3,6 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use nightsplat_synth;
-
 use super::train::small_set;
 
 /// A folder with a dataset of nine small views in `set`, and runs next to it.

@@ -10,7 +10,6 @@ use nightsplat::train::{Part, TrainConfig, Trainer};
 use nightsplat_photographs::dataset::{Dataset, Split, View};
 use nightsplat_photographs::image::{linear_from_srgb, srgb_from_linear};
 use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat_synth;
 
 use crate::common::train::{advance, small_set};
 

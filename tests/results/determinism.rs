@@ -10,7 +10,6 @@ use std::thread::JoinHandle;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{Background, TrainConfig, Trainer};
-use nightsplat_synth;
 
 use crate::common::command::succeed;
 use crate::common::train::{advance, dataset, small_set};

@@ -19,7 +19,6 @@ use nightsplat_core::random::Stream;
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::image::{Image, ImageFile};
 use nightsplat_photographs::tone::{Statistics, Tone, ToneCurve, ToneSettings};
-use nightsplat_synth;
 
 use crate::common::Random;
 use crate::common::setup::{Gradients, Setup, tile_of, variants};

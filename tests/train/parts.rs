@@ -12,7 +12,6 @@ use nightsplat::train::{Part, Rendered, StepReport, TrainConfig, Trainer};
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::image::{Image, ImageFile};
 use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat_synth;
 
 use crate::common::command::{refused, succeed};
 use crate::common::train::{small_set, train};

@@ -12,7 +12,6 @@ use nightsplat::splats::scene::Attribute;
 use nightsplat::train::{Background, EndReason, Part, StepReport, TrainConfig, Trainer};
 use nightsplat_photographs::dataset::{Dataset, Split, View};
 use nightsplat_photographs::image::Image;
-use nightsplat_synth;
 use safetensors::SafeTensors;
 
 use crate::common::command::{command, refused, succeed};

@@ -5,10 +5,11 @@
 //! - [`input`]: files that users name, read whole
 //! - [`output`]: files that appear when complete
 //! - [`csv`]: tables of comma-separated values
+//! - [`table`]: tables of text
 //! - [`ply`]: headers of PLY files
 //! - [`hash`]: checksums of numbers and bytes
 //! - [`random`]: counter-based random numbers
-//! - [`settings`]: a row for each setting: key, default, rule, unit, help, option
+//! - [`settings`](mod@settings): a row for each setting: key, default, rule, unit, help, option
 //! - [`camera`]: cameras and lens distortion
 //! - [`image`]: images in memory
 //! - [`curves`]: the formulas of tone curves
@@ -24,5 +25,6 @@ pub mod output;
 pub mod ply;
 pub mod random;
 pub mod settings;
+pub mod table;
 
 pub use error::{Error, Result, Stop};

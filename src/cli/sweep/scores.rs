@@ -6,7 +6,7 @@ use nightsplat_core::output::{own_file, write_whole};
 use nightsplat_photographs::dataset::View;
 use serde_json::{Value, json};
 
-use crate::cli::driver;
+use crate::cli::opener;
 use crate::gpu::Gpu;
 use crate::networks::lpips::{Lpips, Range};
 use crate::results::eval::{Evaluation, Extras, ScoreReference};
@@ -25,7 +25,7 @@ pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range)
             continue;
         }
         let FinishedRun { gpu, config, dataset, mut model_renderer, .. } =
-            FinishedRun::open_lit(run, None, &driver::opener(None))?;
+            FinishedRun::open_lit(run, None, &opener(None))?;
         let lpips = Lpips::load(&gpu, weights, range)?;
         let mut reference = ScoreReference::new(&gpu, &config.tone, &dataset)?;
         let is_even = reference.is_evenly_lit(&dataset);

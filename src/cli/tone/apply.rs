@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::output::{create_folder, one_line};
+use nightsplat_core::table::aligned;
 use nightsplat_photographs::dataset::{Dataset, Split};
 use nightsplat_photographs::findings::findings;
 use nightsplat_photographs::image::{ColourCounts, Image, Mask, Orientation, PictureFile};
@@ -22,7 +23,8 @@ use serde::Serialize;
 use self::page::TonePage;
 use self::photographs::{InputPhotograph, listed};
 use crate::cli::settings::{CurveOptions, Selection, SettingOptions};
-use crate::cli::{OutputFormat, driver, finish, print, progress_bar, table, word, words};
+use crate::cli::{OutputFormat, finish, print, progress_bar, word, words};
+use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
 use crate::results::report::Distribution;
@@ -243,7 +245,7 @@ fn text_table(output: &ToneOutput) -> String {
     let reason = output.exposure.as_ref().map(|exposure| format!("{}\n", exposure.reason()));
     let label = output.with_reference.as_deref().map(eval::with_reference);
     let label = label.map(|line| line + "\n").unwrap_or_default();
-    reason.unwrap_or_default() + &table::aligned(&rows) + &remarks + &label
+    reason.unwrap_or_default() + &aligned(&rows) + &remarks + &label
 }
 
 /// Maps every photograph and writes it to `args.out` under its own name. Of several photographs, unusable ones are

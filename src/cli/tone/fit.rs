@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use nightsplat_core::output::write_whole;
+use nightsplat_core::table::aligned;
 use nightsplat_fit::{
     Channels, CurveFit, CurveScores, Estimate, FitOptions, FitScene, HeldOut, Pair, Weighting,
     cross_validate, fit,
@@ -12,7 +13,6 @@ use nightsplat_photographs::tree::check_writable;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::cli::table::aligned;
 use crate::cli::{finish, print, word};
 use crate::{Error, Result};
 

@@ -3,13 +3,14 @@
 use std::path::PathBuf;
 
 use nightsplat_core::output::write_whole;
+use nightsplat_core::table::aligned;
 use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
 use nightsplat_photographs::image::{ColourCounts, Image, ImageFile};
 use nightsplat_photographs::tone::{
     CurveChoice, FAMILIES, Family, Statistics, Tone, ToneCurve, ToneSettings,
 };
 
-use crate::cli::{finish, print, table, words};
+use crate::cli::{finish, print, words};
 use crate::results::report::{Chart, Series, VerticalLine};
 use crate::{Error, Result};
 
@@ -157,7 +158,7 @@ fn values(curves: &[NamedCurve], at: &[f64], scene: Option<&Statistics>) -> Stri
         row.extend(at.iter().map(|&t| format!("{:.3}", value(settings, t, scene))));
         rows.push(row);
     }
-    table::aligned(&rows)
+    aligned(&rows)
 }
 
 fn chart(curves: &[NamedCurve], scene: Option<&Statistics>) -> Chart {

@@ -1,6 +1,8 @@
-//! A table of numbers, as HTML and as Markdown.
+//! A table of numbers, as HTML, as Markdown and as text.
 
 use std::fmt::Write as _;
+
+use nightsplat_core::table::aligned;
 
 use super::escape;
 
@@ -41,6 +43,21 @@ pub struct NumberTable {
 }
 
 impl NumberTable {
+    /// The table as text with aligned columns.
+    pub fn text(&self) -> String {
+        let Self { label, columns, rows, .. } = self;
+        let mut lines = vec![vec![label.clone()]];
+        lines[0].extend(columns.iter().map(|column| column.name.clone()));
+        for (name, values) in rows {
+            let cell = |(column, value): (&Column, &Option<f64>)| {
+                value.map_or_else(|| "-".to_owned(), |value| format!("{value:.*}", column.digits))
+            };
+            let cells = columns.iter().zip(values).map(cell);
+            lines.push(std::iter::once(name.clone()).chain(cells).collect());
+        }
+        aligned(&lines)
+    }
+
     /// The table as a section of an HTML page, with the best values highlighted.
     pub fn html(&self) -> String {
         let mut html = format!(

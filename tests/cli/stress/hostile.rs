@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::path::PathBuf;
 
 use glam::{DVec2, DVec3, Vec3};
-use nightsplat::cli::bench::scene;
+use nightsplat::bench::scene;
 use nightsplat::loss::exposure::{Affine, table};
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::TrainConfig;
@@ -14,7 +14,6 @@ use nightsplat_core::random::Stream;
 use nightsplat_photographs::dataset::{Dataset, Point, Split, View};
 use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb};
 use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat_synth;
 
 use crate::common::train::small_set;
 

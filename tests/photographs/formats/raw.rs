@@ -5,7 +5,7 @@ use std::path::Path;
 
 use nightsplat::gpu::testing::gpu;
 use nightsplat::targets::pseudo_gt::PseudoGt;
-use nightsplat_photographs::image::{Image, linear_from_srgb, srgb_from_linear};
+use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{InverseTone, MeasuredPhotograph, ToneCurve, ToneSettings};
 use nightsplat_synth::SyntheticOptions;

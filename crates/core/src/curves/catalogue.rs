@@ -54,7 +54,7 @@ macro_rules! families {
         }
 
         $(
-            #[doc = $name]
+            #[doc = concat!("`", $name, "`")]
             pub const $number: u32 = ToneCurve::$variant as u32;
         )*
 

@@ -99,17 +99,21 @@ impl PictureFile {
 pub mod openings {
     use std::collections::HashMap;
     use std::path::{Path, PathBuf};
-    use std::sync::{LazyLock, Mutex};
+    use std::sync::{LazyLock, Mutex, PoisonError};
 
     static COUNTS: LazyLock<Mutex<HashMap<PathBuf, usize>>> = LazyLock::new(Mutex::default);
 
     pub(super) fn count(path: &Path) {
-        *COUNTS.lock().unwrap().entry(path.to_owned()).or_default() += 1;
+        *COUNTS
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .entry(path.to_owned())
+            .or_default() += 1;
     }
 
     /// The counts of the files below a folder.
     pub fn below(folder: &Path) -> Vec<(PathBuf, usize)> {
-        let counts = COUNTS.lock().unwrap();
+        let counts = COUNTS.lock().unwrap_or_else(PoisonError::into_inner);
         let within = counts.iter().filter(|(path, _)| path.starts_with(folder));
         within.map(|(path, count)| (path.clone(), *count)).collect()
     }
@@ -160,8 +164,8 @@ pub trait ImageFile: Sized {
     #[doc(hidden)]
     fn load_counted(path: &Path, counters: &ColourCounts) -> Result<Self>;
 
-    /// [`ImageFile::load`] for values that are not colours, such as depth: they are read as stored, including negative ones
-    /// of EXR.
+    /// [`ImageFile::load`] for values that are not colours, such as depth: they are read as stored, including negative
+    /// ones of EXR.
     #[doc(hidden)]
     fn load_as_stored(path: impl AsRef<Path>) -> Result<Self>;
 

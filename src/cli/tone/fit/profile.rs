@@ -1,6 +1,7 @@
 //! `nightsplat tone fit --profile`: fits a camera profile in place of a curve.
 
 use nightsplat_core::output::write_whole;
+use nightsplat_core::table::aligned;
 use nightsplat_fit::{
     ColourPair, ColourScene, ProfileFold, ProfileScores, cross_validate_profile, fit_profile,
     profile_scores,
@@ -10,7 +11,6 @@ use serde::Serialize;
 
 use super::FitArgs;
 use crate::Result;
-use crate::cli::table::aligned;
 
 /// A fitted profile.
 #[derive(Clone, Debug, Serialize)]

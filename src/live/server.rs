@@ -55,7 +55,7 @@ const HEADERS: [(HeaderName, &str); 5] = [
 
 /// A server on its own thread, until it is dropped.
 #[derive(Debug)]
-pub(in crate::cli) struct Server {
+pub(crate) struct Server {
     address: SocketAddr,
     token: String,
     stop: Option<oneshot::Sender<()>>,
@@ -64,7 +64,7 @@ pub(in crate::cli) struct Server {
 
 impl Server {
     /// Starts to listen. Port 0 is any free one.
-    pub(in crate::cli) fn start(Listen(asked): Listen, site: Arc<Site>) -> Result<Self> {
+    pub(crate) fn start(Listen(asked): Listen, site: Arc<Site>) -> Result<Self> {
         let unusable = |error: std::io::Error| {
             let problem = match error.kind() {
                 std::io::ErrorKind::AddrInUse => "is in use; name another port".to_owned(),
@@ -106,7 +106,7 @@ impl Server {
     }
 
     /// The address of the page.
-    pub(in crate::cli) fn url(&self) -> String {
+    pub(crate) fn url(&self) -> String {
         format!("http://{}/{}/", self.address, self.token)
     }
 }
@@ -213,7 +213,7 @@ mod tests {
     use std::io::{Read, Write};
 
     use super::*;
-    use crate::cli::live::Feed;
+    use crate::live::Feed;
     use crate::splats::scene::Gaussians;
 
     fn server() -> Server {

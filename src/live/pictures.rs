@@ -12,7 +12,7 @@ use nightsplat_photographs::image::{Image, ImageFile};
 use nightsplat_photographs::tone::ToneCurve;
 
 use crate::Result;
-use crate::cli::driver;
+use crate::driver;
 use crate::gpu::Gpu;
 use crate::results::export::page::{Bookmark, PageImage, moved};
 use crate::targets::Targets;
@@ -36,7 +36,7 @@ const KEPT: usize = 64 << 20;
 
 /// The images of a dataset's views.
 #[derive(Debug)]
-pub(in crate::cli) struct Pictures {
+pub(crate) struct Pictures {
     dataset: Arc<Dataset>,
     /// The names of views with a photograph that `dataset` does not have.
     unloaded: BTreeSet<String>,
@@ -53,14 +53,14 @@ pub(in crate::cli) struct Pictures {
 
 impl Pictures {
     /// Loads the dataset of a configuration, but no photograph. Without a device, one is opened for the first target.
-    pub(in crate::cli) fn load(config: TrainConfig, gpu: Option<Gpu>) -> Result<Self> {
+    pub(crate) fn load(config: TrainConfig, gpu: Option<Gpu>) -> Result<Self> {
         let dataset = Dataset::load(&config.dataset, &options(&config))?;
         Ok(Self::new(dataset.into(), BTreeSet::new(), config, gpu))
     }
 
     /// The dataset that a training has loaded, unless it has a fisheye: then it is loaded again for the pinhole cameras
     /// of the viewer.
-    pub(in crate::cli) fn of_training(
+    pub(crate) fn of_training(
         config: TrainConfig,
         gpu: Gpu,
         dataset: &Arc<Dataset>,
@@ -86,18 +86,18 @@ impl Pictures {
         Self { dataset, unloaded, complete: None, config, gpu, targets: None, finished }
     }
 
-    pub(in crate::cli) fn dataset(&self) -> &Dataset {
+    pub(crate) fn dataset(&self) -> &Dataset {
         &self.dataset
     }
 
     /// The world position that the coordinates of models and bookmarks are relative to.
-    pub(in crate::cli) fn origin(&self) -> DVec3 {
+    pub(crate) fn origin(&self) -> DVec3 {
         self.config.frame.unwrap_or_else(|| self.dataset.frame()).file_origin()
     }
 
     /// The cameras of all views, for a model whose origin is that of the dataset's training frame, and the addresses of
     /// their images.
-    pub(in crate::cli) fn bookmarks(&self) -> Vec<Bookmark> {
+    pub(crate) fn bookmarks(&self) -> Vec<Bookmark> {
         let origin = self.origin();
         let bookmark = |(index, view): (usize, &View)| {
             let kinds = KINDS.iter().filter(|(_, kind)| self.has(view, *kind));

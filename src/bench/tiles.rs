@@ -1,13 +1,16 @@
-//! `--tune`: times the rasteriser with every tile size that the device supports, and stores the fastest.
+//! Times the rasteriser with every tile size that the device supports, and stores the fastest.
 
-use anyhow::Result;
+use std::path::PathBuf;
+
 use nightsplat_core::camera::Camera;
+use nightsplat_core::table::aligned;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use super::scene::BenchScene;
-use super::{Bench, finish, median, print, stages, table, total};
-use crate::gpu::{Buffer, Resources, TUNE_VARIABLE, Tile, TunedTile};
+use super::{Bench, median, stages, total};
+use crate::Result;
+use crate::gpu::{Buffer, Resources, Tile, TunedTile};
 use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
 use crate::splats::scene::{DeviceGaussians, Features, Layout, MAX_SH_DEGREE};
 
@@ -46,45 +49,48 @@ struct TileTiming {
     resources: Option<[Resources; 2]>,
 }
 
-/// Measures every case, stores the fastest tiles and prints.
-pub(super) fn run(bench: &Bench, sizes: &[[u32; 2]], as_json: bool) -> Result<()> {
-    let mut cases = vec![];
-    for features in FEATURES {
-        for &size in sizes {
-            cases.push(Case::measure(bench, &bench.source.scene(size, features))?);
+/// Every tile at every size and number of channels, and the fastest.
+pub(crate) struct TileTimings {
+    cases: Vec<Case>,
+    /// The fastest tile for each number of channels.
+    pub(crate) fastest: Vec<TunedTile>,
+    /// The file that has them; `None` where tuning is off.
+    pub(crate) file: Option<PathBuf>,
+}
+
+impl TileTimings {
+    /// Measures every case, and stores the fastest tiles.
+    pub(crate) fn measure(bench: &Bench, sizes: &[[u32; 2]]) -> Result<Self> {
+        let mut cases = vec![];
+        for features in FEATURES {
+            for &size in sizes {
+                cases.push(Case::measure(bench, &bench.source.scene(size, features))?);
+            }
         }
+        let fastest: Vec<_> =
+            FEATURES.iter().filter_map(|f| fastest(&cases, f.channels())).collect();
+        let file = bench.gpu.keep_tuned_tiles(&fastest)?;
+        Ok(Self { cases, fastest, file })
     }
-    let chosen: Vec<_> = FEATURES.iter().filter_map(|f| fastest(&cases, f.channels())).collect();
-    let file = bench.gpu.keep_tuned_tiles(&chosen)?;
-    if as_json {
+
+    pub(crate) fn as_json(&self, bench: &Bench) -> Value {
         let properties = bench.gpu.properties();
-        let report = json!({
+        json!({
             "device": properties.name,
             "driver": properties.driver,
             "subgroup_size": properties.subgroup_size,
             "scene": bench.source.name(),
             "repeats": bench.repeats,
-            "cases": cases.iter().map(Case::as_json).collect::<Vec<_>>(),
-            "tiles": chosen,
-            "file": file,
-        });
-        return Ok(print(format_args!("{report:#}"))?);
+            "cases": self.cases.iter().map(Case::as_json).collect::<Vec<_>>(),
+            "tiles": self.fastest,
+            "file": self.file,
+        })
     }
-    for case in &cases {
-        print(case.as_text())?;
+
+    /// A table for each case.
+    pub(crate) fn tables(&self) -> impl Iterator<Item = String> {
+        self.cases.iter().map(Case::as_text)
     }
-    if !bench.gpu.properties().has_pipeline_statistics {
-        print("registers and spills: not reported by the driver")?;
-    }
-    let tile = |TunedTile { channels, tile }: &TunedTile| format!("{tile} at {channels} channels");
-    let fastest = chosen.iter().map(tile).collect::<Vec<_>>().join(", ");
-    match &file {
-        Some(_) => print(format_args!("fastest: {fastest}"))?,
-        None => print(format_args!("fastest: {fastest}; not stored, as {TUNE_VARIABLE} is off"))?,
-    }
-    let wrote = file.map(|file| file.display().to_string()).unwrap_or_default();
-    finish(&wrote, "nightsplat train photos --out run");
-    Ok(())
 }
 
 /// The tile with the least sum over sizes of its time relative to the fastest at that size. One whose kernels spill is
@@ -104,7 +110,7 @@ fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
 }
 
 impl Case {
-    fn measure(bench: &Bench, scene: &BenchScene) -> crate::Result<Self> {
+    fn measure(bench: &Bench, scene: &BenchScene) -> Result<Self> {
         let BenchScene { camera, gaussians, .. } = scene;
         let gpu = &bench.gpu;
         let on_device = gaussians.upload(gpu)?;
@@ -125,7 +131,7 @@ impl Case {
                 .map(|all| all.each_ref().map(|kernel| Resources::from_statistics(kernel)));
             Ok((tile, renderer, resources))
         });
-        let compiled = compiled.collect::<crate::Result<Vec<_>>>()?;
+        let compiled = compiled.collect::<Result<Vec<_>>>()?;
         let (mut candidates, mut first) = (vec![], None);
         for (tile, mut renderer, resources) in compiled {
             renderer.reserve(gaussians.count, [camera])?;
@@ -201,7 +207,7 @@ impl Case {
         let registers: String = self.tiles.iter().filter_map(TileTiming::registers).collect();
         format!(
             "{channels} channels, {width}x{height} pixels, {gaussians} Gaussians\n{}{registers}",
-            table::aligned(&rows)
+            aligned(&rows)
         )
     }
 }
@@ -219,11 +225,7 @@ struct Pass {
 }
 
 impl Pass {
-    fn new(
-        Bench { gpu, .. }: &Bench,
-        camera: Camera,
-        gaussians: DeviceGaussians,
-    ) -> crate::Result<Self> {
+    fn new(Bench { gpu, .. }: &Bench, camera: Camera, gaussians: DeviceGaussians) -> Result<Self> {
         let Layout { count, shape, .. } = gaussians.layout;
         let values = shape.features.channels() * camera.width as usize * camera.height as usize;
         Ok(Self {
@@ -237,7 +239,7 @@ impl Pass {
     }
 
     /// Milliseconds of forward and backward blending, and of all passes.
-    fn profile(&mut self, bench: &Bench, renderer: &mut Renderer) -> crate::Result<[f64; 3]> {
+    fn profile(&mut self, bench: &Bench, renderer: &mut Renderer) -> Result<[f64; 3]> {
         let Self { camera, gaussians, d_render, .. } = self;
         let times = bench.gpu.profile("tune", |pass| {
             renderer.forward(pass, &*gaussians, &*camera, &OPTIONS)?;

@@ -1,26 +1,9 @@
-//! Tables for the terminal.
+//! Tables of text.
 
-use nightsplat_core::output::one_line;
-
-use crate::results::report::{Column, NumberTable};
-
-/// A table of the report as text.
-pub(super) fn text(table: &NumberTable) -> String {
-    let NumberTable { label, columns, rows, .. } = table;
-    let mut lines = vec![vec![label.clone()]];
-    lines[0].extend(columns.iter().map(|column| column.name.clone()));
-    for (name, values) in rows {
-        let cell = |(column, value): (&Column, &Option<f64>)| {
-            value.map_or_else(|| "-".to_owned(), |value| format!("{value:.*}", column.digits))
-        };
-        let cells = columns.iter().zip(values).map(cell);
-        lines.push(std::iter::once(name.clone()).chain(cells).collect());
-    }
-    aligned(&lines)
-}
+use crate::output::one_line;
 
 /// The rows with aligned columns: the first to the left, the others to the right.
-pub(super) fn aligned(rows: &[Vec<String>]) -> String {
+pub fn aligned(rows: &[Vec<String>]) -> String {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let cell_width = |row: &Vec<String>, column: usize| {
         row.get(column).map_or(0, |cell| one_line(cell).chars().count())

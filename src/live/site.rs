@@ -10,11 +10,11 @@ use super::pictures::Pictures;
 
 /// The page, and what it asks for.
 #[derive(Debug)]
-pub(in crate::cli) struct Site {
-    pub(in crate::cli) html: Bytes,
-    pub(in crate::cli) feed: Feed,
+pub(crate) struct Site {
+    pub(crate) html: Bytes,
+    pub(crate) feed: Feed,
     /// Of the dataset, if there is one. One image is made at a time.
-    pub(in crate::cli) pictures: Option<Mutex<Pictures>>,
+    pub(crate) pictures: Option<Mutex<Pictures>>,
 }
 
 /// The answer to a request.

@@ -8,7 +8,6 @@ use std::process::{Command, ExitStatus, Stdio};
 use nightsplat_core::output::write_whole;
 
 use crate::gpu::{DeviceChoice, DeviceReport, Gpu, SchedulerVariables, cache_folder, devices};
-use crate::results::finished_run::Opener;
 use crate::self_test::TEST_VARIABLE;
 use crate::{Error, Result};
 
@@ -16,19 +15,14 @@ use crate::{Error, Result};
 const COMPILES: &str = "compiles";
 
 /// [`Gpu::new`], after a driver that is new on this machine was seen to compile every kernel.
-pub(super) fn open(choice: &DeviceChoice) -> Result<Gpu> {
+pub(crate) fn open(choice: &DeviceChoice) -> Result<Gpu> {
     let _phase = tracing::info_span!("device").entered();
     check_new(choice)?;
     Gpu::new(choice)
 }
 
-/// How a command opens the device of a run: the chosen one, or that of its configuration.
-pub(super) fn opener(device: Option<&DeviceChoice>) -> Opener {
-    Opener { device: device.cloned(), open }
-}
-
 /// Refuses a driver that is new on this machine and crashes when it compiles a kernel.
-pub(super) fn check_new(choice: &DeviceChoice) -> Result<()> {
+pub(crate) fn check_new(choice: &DeviceChoice) -> Result<()> {
     let wanted = std::env::var(TEST_VARIABLE).unwrap_or_default();
     if wanted != "off" {
         let devices = devices()?;

@@ -19,7 +19,7 @@ use crate::train::{Part, PrecisionConfig, TrainConfig, Trainer};
 
 /// Where the Gaussians come from.
 #[derive(Debug)]
-pub(super) enum Source {
+pub(crate) enum Source {
     /// This number is made.
     Synthetic(usize),
     /// A trained model, seen by a camera.
@@ -29,7 +29,7 @@ pub(super) enum Source {
 impl Source {
     /// Reads a model. A run is seen by its first training camera; a file has no cameras, and is seen along z from where
     /// most of it is in view.
-    pub(super) fn open(path: &Path, size: [u32; 2]) -> Result<Self> {
+    pub(crate) fn open(path: &Path, size: [u32; 2]) -> Result<Self> {
         let (gaussians, facts) = models::read(path)?;
         let mut model = Model::of_shown(gaussians, &facts);
         let camera_of_run = match path.is_dir() {
@@ -48,7 +48,7 @@ impl Source {
     }
 
     /// The width and height of the camera; the synthetic scene fits any.
-    pub(super) fn size(&self) -> Option<[u32; 2]> {
+    pub(crate) fn size(&self) -> Option<[u32; 2]> {
         match self {
             Self::Synthetic(_) => None,
             Self::Model { camera, .. } => Some([camera.width, camera.height]),
@@ -56,7 +56,7 @@ impl Source {
     }
 
     /// The scene in a view of this size.
-    pub(super) fn scene(&self, [width, height]: [u32; 2], features: Features) -> BenchScene {
+    pub(crate) fn scene(&self, [width, height]: [u32; 2], features: Features) -> BenchScene {
         match self {
             Self::Synthetic(count) => {
                 let camera = camera(width, height);
@@ -71,7 +71,7 @@ impl Source {
         }
     }
 
-    pub(super) fn name(&self) -> String {
+    pub(crate) fn name(&self) -> String {
         match self {
             Self::Synthetic(_) => "synthetic".to_owned(),
             Self::Model { path, .. } => path.display().to_string(),
@@ -104,7 +104,7 @@ impl BenchScene {
     }
 
     /// The settings of a renderer of the scene.
-    pub(super) fn render_settings(&self) -> RenderSettings {
+    pub(crate) fn render_settings(&self) -> RenderSettings {
         let defaults = RenderSettings { shape: self.gaussians.shape, ..RenderSettings::default() };
         RenderSettings { near: self.near.unwrap_or(defaults.near), ..defaults }
     }
@@ -122,18 +122,18 @@ impl BenchScene {
 }
 
 /// Trainers of the scene.
-pub(super) struct Trainers {
+pub(crate) struct Trainers {
     /// Colour only, with SH of degree 3.
-    pub(super) plain: Trainer,
+    pub(crate) plain: Trainer,
     /// Every part, small enough for the references.
-    pub(super) lita: Trainer,
+    pub(crate) lita: Trainer,
     /// The checked passes of its initialisation and targets.
-    pub(super) lita_begins: CheckReport,
+    pub(crate) lita_begins: CheckReport,
     /// Number of splat-tile intersections of the plain scene.
-    pub(super) intersections: u32,
+    pub(crate) intersections: u32,
 }
 
-pub(super) fn trainers(
+pub(crate) fn trainers(
     gpu: &Gpu,
     scene: &BenchScene,
     precision: &PrecisionConfig,

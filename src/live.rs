@@ -9,8 +9,8 @@ mod pictures;
 mod server;
 mod site;
 
-pub(super) use self::feed::Feed;
+pub(crate) use self::feed::Feed;
 pub use self::listen::{DEFAULT_ADDRESS, Listen};
-pub(super) use self::pictures::Pictures;
-pub(super) use self::server::Server;
-pub(super) use self::site::Site;
+pub(crate) use self::pictures::Pictures;
+pub(crate) use self::server::Server;
+pub(crate) use self::site::Site;

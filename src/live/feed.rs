@@ -38,7 +38,7 @@ enum FeedSource {
 
 /// The source of the model and the progress.
 #[derive(Debug)]
-pub(in crate::cli) struct Feed {
+pub(crate) struct Feed {
     /// To the training in this process.
     requests: Option<Requests>,
     state: Mutex<FeedState>,
@@ -66,13 +66,13 @@ struct FeedState {
 
 impl Feed {
     /// Of a run directory; `requests`: to its training, if that is in this process.
-    pub(in crate::cli) fn of_run(run: &Path, requests: Option<Requests>) -> Self {
+    pub(crate) fn of_run(run: &Path, requests: Option<Requests>) -> Self {
         let state = Mutex::new(FeedState::new(FeedSource::Run(WatchedRun::new(run.to_owned()))));
         Self { requests, state }
     }
 
     /// Of a model file, with its Gaussians.
-    pub(in crate::cli) fn of_file(path: &Path) -> Result<(Self, Gaussians, ModelFacts)> {
+    pub(crate) fn of_file(path: &Path) -> Result<(Self, Gaussians, ModelFacts)> {
         let mut state = FeedState::new(FeedSource::File(path.to_owned()));
         // Before reading: a file that changes meanwhile is read again.
         state.file = stamp(path).ok();
@@ -82,14 +82,14 @@ impl Feed {
     }
 
     /// Of Gaussians that do not change.
-    pub(in crate::cli) fn of_gaussians(gaussians: &Gaussians) -> Self {
+    pub(crate) fn of_gaussians(gaussians: &Gaussians) -> Self {
         let mut state = FeedState::new(FeedSource::Fixed);
         state.show(gaussians, None);
         Self { requests: None, state: Mutex::new(state) }
     }
 
     /// Takes what the training in this process reports.
-    pub(in crate::cli) fn observe(&self, event: Event<'_>) {
+    pub(crate) fn observe(&self, event: Event<'_>) {
         let Event::Snapshot { step, model, seconds } = event else { return };
         let begin = Instant::now();
         let mut state = self.lock();
