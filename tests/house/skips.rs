@@ -8,7 +8,8 @@ use crate::architecture::files;
 /// What a script or a test prints of its own accord cannot fail.
 #[test]
 fn tests_and_scripts_say_that_they_are_not_run_by_one_function() {
-    let folders = [("src", "rs"), ("tests", "rs"), ("scripts", "sh"), ("scripts", "py")];
+    let folders =
+        [("src", "rs"), ("crates", "rs"), ("tests", "rs"), ("scripts", "sh"), ("scripts", "py")];
     for (path, text) in folders.into_iter().flat_map(|(folder, kind)| files(folder, kind)) {
         let is_the_one = path.ends_with("skips.rs") || path.ends_with("not-run.sh");
         for print in ["echo \"not run", "print(\"not run", "print(f\"not run", "!(\"not run"] {
