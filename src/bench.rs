@@ -44,9 +44,9 @@ pub(crate) struct Findings {
     steady: Option<Steady>,
 }
 
-/// What is measured in addition to kernels and stages.
+/// What else is measured, beside kernels and stages.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Measurements {
+pub(crate) struct BenchOptions {
     /// Whether the step is not checked.
     pub(crate) unchecked: bool,
     /// Whether the device's limits are measured.
@@ -59,26 +59,30 @@ pub(crate) struct Measurements {
 
 impl Findings {
     /// Checks and times.
-    pub(crate) fn gather(bench: &Bench, scene: &BenchScene, extent: &Measurements) -> Result<Self> {
+    pub(crate) fn gather(
+        bench: &Bench,
+        scene: &BenchScene,
+        options: &BenchOptions,
+    ) -> Result<Self> {
         let mut trainers = scene::trainers(&bench.gpu, scene, &bench.precision)?;
-        let checked = match extent.unchecked {
+        let checked = match options.unchecked {
             true => CheckReport::default(),
             false => stages::check(bench, &mut trainers)?,
         };
-        let mut ceiling = match extent.ceilings || extent.warm > 0.0 {
+        let mut ceiling = match options.ceilings || options.warm > 0.0 {
             true => Some(Ceiling::large(&bench.gpu)?),
             false => None,
         };
         if let Some(ceiling) = &mut ceiling {
-            ceiling.warm(&bench.gpu, Duration::from_secs_f64(extent.warm))?;
+            ceiling.warm(&bench.gpu, Duration::from_secs_f64(options.warm))?;
         }
         let kernels = stages::time_kernels(bench, &mut trainers)?;
         let stages = stages::time(bench, &mut trainers)?;
-        let ceilings = match ceiling.filter(|_| extent.ceilings) {
+        let ceilings = match ceiling.filter(|_| options.ceilings) {
             Some(mut ceiling) => Some(Ceilings::measure(bench, &mut ceiling)?),
             None => None,
         };
-        let steady = match extent.steady {
+        let steady = match options.steady {
             0 => None,
             steps => Some(steady::time(bench, &mut trainers.plain, steps)?),
         };

@@ -8,7 +8,7 @@ use anyhow::Result;
 use super::{finish, print};
 use crate::Error;
 use crate::bench::tiles::TileTimings;
-use crate::bench::{Bench, Findings, Measurements, Source};
+use crate::bench::{Bench, BenchOptions, Findings, Source};
 use crate::driver;
 use crate::gpu::{DeviceChoice, TUNE_VARIABLE, TunedTile};
 use crate::splats::scene::Features;
@@ -104,7 +104,7 @@ pub fn run(args: &BenchArgs) -> Result<()> {
     let findings = Findings::gather(
         &bench,
         &scene,
-        &Measurements {
+        &BenchOptions {
             unchecked: args.unchecked,
             ceilings: args.ceilings,
             warm: args.warm,

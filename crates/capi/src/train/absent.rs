@@ -1,4 +1,4 @@
-//! A build without training: each function says so.
+//! A build without training: every function is refused with `NSP_ERROR_UNSUPPORTED`.
 
 use std::ffi::c_char;
 

@@ -127,7 +127,6 @@ pub struct PathOptions {
     /// The number of frames, instead of that of the times.
     pub frames: Option<usize>,
     /// Frames per second, instead of the file's.
-    /// Frames per second, if the file says.
     pub fps: Option<f64>,
     /// How a camera moves between keyframes.
     pub easing: Option<Easing>,
