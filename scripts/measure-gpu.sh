@@ -31,7 +31,7 @@
 #         lom.txt           training by the paper's protocol, plain and with every part: scores, or the last steps
 #         growth.txt        how time and memory grow
 #
-# Variables. pack: PROFILE=release, TESTS (the test targets; all), and NIGHTSPLAT_PROTOTYPES, a folder of kernels to
+# Variables. pack: PROFILE=release, TESTS (the test targets; all; `none`), and NIGHTSPLAT_PROTOTYPES, a folder of kernels to
 # compare with those of the program: blend_forward.comp and blend_backward.comp, with the interfaces of those, subst.py,
 # which fits them to the modules of a run, and ../wrap.c, a driver around the real one that replaces modules by hash;
 # PROTOTYPE_FLAGS, for glslangValidator. run: ONLY, the experiments by the names of their functions (all); DRIVER, the
@@ -78,11 +78,14 @@ pack() {
     trap "rm -rf '$stage'" EXIT
     mkdir -p "$dir" "$stage"/{lib,layers,scene,source,tests,x11}
 
-    local program growth tests
-    program=$(cargo build --profile "$profile" --bin nightsplat "$messages" | executables '"kind":\["bin"\]')
-    tests=$(cargo test --no-run --profile "${profile/release/checked}" "${targets[@]}" "$messages" |
-        executables '"profile":{[^}]*"test":true}')
-    growth=$(cargo build --profile "$profile" --example growth "$messages" | executables '"kind":\["example"\]')
+    local built program growth tests=
+    # At once, so that the features of dependencies, which differ with examples, are those of one build.
+    built=$(cargo build --profile "$profile" --bin nightsplat --example growth "$messages")
+    program=$(executables '"kind":\["bin"\]' <<< "$built")
+    growth=$(executables '"kind":\["example"\]' <<< "$built")
+    [ "${TESTS:-}" = none ] ||
+        tests=$(cargo test --no-run --profile "${profile/release/checked}" "${targets[@]}" "$messages" |
+            executables '"profile":{[^}]*"test":true}')
     strip -o "$stage/nightsplat" "$program"
     strip -o "$stage/growth" "$growth"
     for test in $tests; do strip -o "$stage/tests/$(basename "$test")" "$test"; done
@@ -258,14 +261,6 @@ run_tests() {
         fi
     done
     echo "$passed of $all test binaries pass" | tee -a "$found/tests.txt" "$out/summary.txt"
-}
-
-# value FILE NAME: the first number or text with this name.
-value() { sed -n "s/^ *\"$2\": \(.*[^,]\),\{0,1\}$/\1/p" "$out/$1" 2> /dev/null | head -n 1 | tr -d '"'; }
-
-# members FILE NAME: the names and values of an object, the largest first.
-members() {
-    sed -n "/^  \"$2\": {/,/^  }/s/^    \"\(.*\)\": \([^,]*\),\{0,1\}$/\1 \2/p" "$out/$1" 2> /dev/null | sort -k 2 -gr
 }
 
 # value FILE NAME: the first number or text with this name.
