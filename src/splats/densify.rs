@@ -39,18 +39,56 @@ pub enum DensityControl {
     Paper,
 }
 
+/// What a kind of density control does in a run, beside its kernels.
+#[derive(Clone, Copy, Debug)]
+pub struct DensityStrategy {
+    /// Its name in settings.
+    pub name: &'static str,
+    /// Splits keep the render: a Gaussian is split only where the views of the cameras hardly change, and a round that
+    /// costs the training views is repeated with fewer splits.
+    pub keeps_views: bool,
+    /// Each round takes its share of the headroom below the limit instead of all that is left.
+    pub spreads_growth: bool,
+    /// Where there are few points, the first round adds Gaussians at rendered depths.
+    pub seeds_depths: bool,
+}
+
+impl DensityControl {
+    const ALL: [Self; 2] = [Self::Conserving, Self::Paper];
+
+    /// The names of all, as in settings.
+    pub(crate) const NAMES: [&str; 2] =
+        [Self::ALL[0].strategy().name, Self::ALL[1].strategy().name];
+
+    /// What it does.
+    #[doc(hidden)]
+    pub const fn strategy(self) -> DensityStrategy {
+        match self {
+            Self::Conserving => DensityStrategy {
+                name: "conserving",
+                keeps_views: true,
+                spreads_growth: true,
+                seeds_depths: true,
+            },
+            Self::Paper => DensityStrategy {
+                name: "paper",
+                keeps_views: false,
+                spreads_growth: false,
+                seeds_depths: false,
+            },
+        }
+    }
+}
+
 impl FromStr for DensityControl {
     type Err = Error;
 
     fn from_str(name: &str) -> Result<Self> {
-        match name {
-            "conserving" => Ok(Self::Conserving),
-            "paper" => Ok(Self::Paper),
-            _ => {
-                let problem = format!("unknown density control `{name}`; conserving or paper");
-                Err(Error::Usage(problem))
-            }
-        }
+        let is_named = |control: &Self| control.strategy().name == name;
+        Self::ALL.into_iter().find(is_named).ok_or_else(|| {
+            let known = Self::NAMES.join(" or ");
+            Error::Usage(format!("unknown density control `{name}`; {known}"))
+        })
     }
 }
 
@@ -126,7 +164,7 @@ pub struct DensifyReport {
 pub struct Densifier {
     gpu: Gpu,
     settings: DensifySettings,
-    /// The cameras whose views conserving splits must not change; empty for the paper's control.
+    /// The cameras whose views splits must not change; empty for a control that does not keep views.
     cameras: Buffer<kernels::Camera>,
     score: Pipeline<densify_score::Kernel>,
     decide: Pipeline<densify_decide::Kernel>,
@@ -182,7 +220,7 @@ impl Densifier {
                 return Err(Error::Usage(problem));
             }
         }
-        let conserving = settings.control == DensityControl::Conserving;
+        let conserving = settings.control.strategy().keeps_views;
         let rest_by_column = rest_by_column(gpu);
         let cameras = if conserving { cameras } else { &[] };
         let cameras: Vec<kernels::Camera> =

@@ -15,11 +15,12 @@ use rayon::prelude::*;
 use safetensors::tensor::{Dtype, TensorView};
 use serde::{Deserialize, Serialize};
 
-use super::best::{Snapshot, Tensor};
+use super::config::TrainConfig;
 use super::decisions::Decisions;
+use super::gaussians::TrainedGaussians;
 use super::lamp::LEARNED;
-use super::model::TrainedModel;
-use super::{TrainConfig, Trainer};
+use super::model::{Snapshot, Tensor, TrainedModel};
+use super::trainer::Trainer;
 use crate::gpu::{Gpu, SliceMut};
 use crate::kernels::lamp::{LAMP_NUMBERS, LAMP_WIDTH};
 use crate::networks::TensorFile;
@@ -128,11 +129,11 @@ impl Trainer {
         let gpu = self.gpu.clone();
         let mut header = CheckpointHeader {
             format: FORMAT.to_owned(),
-            step: self.step,
+            step: self.clock.step,
             config: self.config.to_toml()?,
-            decisions: self.convergence.decisions.clone(),
+            decisions: self.clock.decisions.clone(),
             left_out: self.supervision.views.left_out(),
-            dataset: self.fingerprint.clone(),
+            dataset: self.scene.fingerprint.clone(),
             checksum: String::new(),
         };
         let downloads = self.tensors(|_| true)?;
@@ -140,10 +141,9 @@ impl Trainer {
             self.refuse_values(name, values)?;
         }
         let current = downloads.iter().map(|tensor| (tensor.0.clone(), tensor));
-        let best =
-            self.convergence.best.iter().map(|tensor| (format!("{BEST}{}", tensor.0), tensor));
+        let best = self.model.best.iter().map(|tensor| (format!("{BEST}{}", tensor.0), tensor));
         let named: Vec<(String, &Tensor)> = current.chain(best).collect();
-        let mut visits = gpu.read(&self.model.visit_counts)?;
+        let mut visits = gpu.read(&self.model.gaussians.visit_counts)?;
         visits.truncate(self.model.count());
         let tensors =
             named.iter().map(|(name, (_, _, values))| (name.clone(), bytemuck::cast_slice(values)));
@@ -202,34 +202,60 @@ impl Trainer {
         let (header, begun) = self.header_of(path, &file)?;
         let visits: Vec<u32> = values(&file, VISIT_COUNTS, Dtype::U32, None).map_err(damaged)?;
         let gpu = self.gpu.clone();
-        let mut restored = self.model.zeros_like(&gpu, visits.len(), self.sh_degree_of(&file))?;
+        let sh_degree = self.sh_degree_of(&file);
+        let mut restored = self.model.gaussians.zeros_like(&gpu, visits.len(), sh_degree)?;
         gpu.write(&mut restored.visit_counts, &visits)?;
         let best = best_of(&file).map_err(damaged)?;
-        let fresh = std::mem::replace(&mut self.model, restored);
+        let fresh = std::mem::replace(&mut self.model.gaussians, restored);
         if let Err(error) = self.read_state(&gpu, &file, &header, &damaged) {
-            self.model = fresh;
+            self.model.gaussians = fresh;
             return Err(error);
         }
         self.supervision.views.set_left_out(&header.left_out);
-        (self.step, self.convergence.decisions, self.convergence.best) =
+        (self.clock.step, self.clock.decisions, self.model.best) =
             (header.step, header.decisions, best);
-        self.convergence.decisions.goes_on |= begun.steps != self.config.steps;
+        self.clock.decisions.goes_on |= begun.steps != self.config.steps;
         if let Some(change) = begun.stop.change(&self.config.stop) {
-            tracing::warn!("{change}; this applies from step {} on", self.step);
+            tracing::warn!("{change}; this applies from step {} on", self.clock.step);
         }
-        self.renderer.set_sh_degree(self.model.shape().sh_degree)?;
-        self.reserve()
+        self.model.renderer.set_sh_degree(self.model.gaussians.shape().sh_degree)?;
+        self.model.reserve(&self.supervision.views)
+    }
+
+    /// Reads back the current parameters.
+    pub(super) fn snapshot(&mut self) -> Result<Snapshot> {
+        self.tensors(|name| name.ends_with(".parameters"))
+    }
+
+    /// Restores the parameters; moments and statistics are reset.
+    pub(super) fn restore_snapshot(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let gpu = self.gpu.clone();
+        let shape = |(name, shape, _): &Tensor| {
+            (name == TrainedGaussians::PARAMETERS).then(|| shape.clone())
+        };
+        if let Some([words, count]) = snapshot.iter().find_map(shape).as_deref() {
+            let TrainedModel { gaussians, renderer, .. } = &mut self.model;
+            let sh_degree = gaussians.sh_degree_of_words(*words);
+            *gaussians = gaussians.zeros_like(&gpu, *count, sh_degree)?;
+            renderer.set_sh_degree(gaussians.shape().sh_degree)?;
+        }
+        for state in self.state() {
+            let kept = snapshot.iter().find(|(name, _, _)| *name == state.name);
+            kept.map_or(Ok(()), |(_, _, values)| state.write(&gpu, values))?;
+        }
+        self.model.reserve(&self.supervision.views)
     }
 
     /// The SH degree of a checkpoint's Gaussians, from the columns of their moments.
     fn sh_degree_of(&self, file: &TensorFile<'_>) -> u32 {
-        let whole = self.model.whole_shape();
-        let columns = self.model.moments.planes().first().and_then(|(name, _)| {
+        let gaussians = &self.model.gaussians;
+        let whole = gaussians.whole_shape();
+        let columns = gaussians.moments.planes().first().and_then(|(name, _)| {
             file.tensor(&format!("gaussians.{name}"))?.0.shape.first().copied()
         });
         let fits = |&sh_degree: &u32| Some(width(Shape { sh_degree, ..whole })) == columns;
         // If none fits, reading the tensor reports it.
-        (0..=whole.sh_degree).find(fits).unwrap_or(self.model.shape().sh_degree)
+        (0..=whole.sh_degree).find(fits).unwrap_or(gaussians.shape().sh_degree)
     }
 
     /// The header and settings of a checkpoint that this run can resume from.
@@ -252,7 +278,7 @@ impl Trainer {
                 "was made with {difference}; give the settings of the run, or {anew}"
             )));
         }
-        if let Some(difference) = dataset.difference(&self.fingerprint) {
+        if let Some(difference) = dataset.difference(&self.scene.fingerprint) {
             return Err(refused(format!(
                 "was trained on another dataset ({difference}); give the dataset of the run, or {anew}"
             )));
@@ -283,20 +309,21 @@ impl Trainer {
 
     /// The error for a value of the state, from its tensor's name.
     pub(super) fn not_finite(&self, name: &str, at: usize) -> Error {
-        let layout = self.model.gaussians.layout;
+        let layout = self.model.gaussians.values.layout;
         match name.strip_prefix("gaussians.") {
             Some("parameters") => self.not_finite_in(at, layout.words()),
             Some(_) => self.not_finite_in(at, layout.floats().columns),
             None => {
-                Error::ParameterNotFinite { step: self.step, plane: name.to_owned(), gaussian: at }
+                let (step, plane) = (self.clock.step, name.to_owned());
+                Error::ParameterNotFinite { step, plane, gaussian: at }
             }
         }
     }
 
     /// [`Self::not_finite`] for Gaussians with `columns` columns.
     fn not_finite_in(&self, at: usize, columns: usize) -> Error {
-        let (plane, gaussian) = self.model.place_of(at, columns);
-        Error::ParameterNotFinite { step: self.step, plane, gaussian }
+        let (plane, gaussian) = self.model.gaussians.place_of(at, columns);
+        Error::ParameterNotFinite { step: self.clock.step, plane, gaussian }
     }
 
     /// Reads every tensor before changing any but the model's.
@@ -327,9 +354,10 @@ impl Trainer {
 
     /// The state that the next step depends on, except the visit counts, which are integers.
     pub(super) fn state(&mut self) -> Vec<StateTensor<'_>> {
-        let trained = self.model.trained_planes(&self.gpu);
-        let TrainedModel { gaussians, moments, grad_norm_sums, .. } = &mut self.model;
-        let layout = gaussians.layout;
+        let TrainedModel { gaussians, renderer, optimizer, .. } = &mut self.model;
+        let trained = gaussians.trained_planes(&self.gpu);
+        let TrainedGaussians { values, moments, grad_norm_sums, .. } = gaussians;
+        let layout = values.layout;
         let of_parameters =
             (vec![layout.words(), layout.count], layout.parameter_batches(&self.gpu));
         let of_moments = (vec![layout.floats().columns, layout.count], trained);
@@ -337,7 +365,7 @@ impl Trainer {
         let shape = vec![layout.count];
         let buffer = grad_norm_sums.slice_mut();
         let mut state = vec![StateTensor { name, shape, buffer, batches: None }];
-        let (parameters, moments) = (gaussians.parameters.slice_mut(), moments.slice_mut());
+        let (parameters, moments) = (values.parameters.slice_mut(), moments.slice_mut());
         state.extend(optimized("gaussians", parameters, moments).enumerate().map(
             |(plane, (name, buffer))| {
                 let (shape, batches) = if plane == 0 { &of_parameters } else { &of_moments };
@@ -355,8 +383,7 @@ impl Trainer {
                 batches: None,
             }));
         }
-        if let Some((learning, (lamp, _))) =
-            self.optimizer.lamp.as_mut().zip(self.renderer.lamp_and_status())
+        if let Some((learning, (lamp, _))) = optimizer.lamp.as_mut().zip(renderer.lamp_and_status())
         {
             let (numbers, moments) = (lamp.numbers.slice_mut(), learning.moments.slice_mut());
             state.extend(optimized(LEARNED, numbers, moments).enumerate().map(

@@ -260,7 +260,7 @@ settings! {
 pub struct DensityConfig {
     /// Densification: conserving splits a Gaussian into two that cover the same area; paper clones and splits as
     /// LITA-GS.
-    control: DensityControl = DensityControl::Conserving => Rule::OneOf(&["conserving", "paper"]), "--density NAME";
+    control: DensityControl = DensityControl::Conserving => Rule::OneOf(&DensityControl::NAMES), "--density NAME";
     /// Densify Gaussians whose mean screen-space gradient, in normalised device coordinates, has at least this norm.
     gradient_threshold: f64 = 4e-4 => Rule::POSITIVE;
     /// Paper's control only: split Gaussians larger than this fraction of the extent, clone smaller ones.
@@ -276,10 +276,7 @@ pub struct DensityConfig {
 impl DensityConfig {
     /// At most this many first Gaussians count as sparse.
     pub(super) fn sparse_threshold(&self) -> usize {
-        match self.control {
-            DensityControl::Conserving => self.depth_seeding / 10,
-            DensityControl::Paper => 0,
-        }
+        if self.control.strategy().seeds_depths { self.depth_seeding / 10 } else { 0 }
     }
 
     /// The values of LITA-GS.

@@ -5,7 +5,7 @@ use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::dataset::block::{Block, Cell};
 use rayon::prelude::*;
 
-use super::TrainConfig;
+use super::config::TrainConfig;
 use crate::splats::joined::{MANIFEST, TileManifest};
 use crate::splats::scene::Gaussians;
 use crate::{Error, Result};

@@ -9,13 +9,19 @@ use nightsplat_core::camera::{Camera, Patch};
 use nightsplat_core::random::Stream;
 use nightsplat_photographs::image::Image;
 
+use super::clock::Clock;
+use super::config::TrainConfig;
+use super::gaussians::TrainedGaussians;
 use super::model::TrainedModel;
 use super::patches::put_together;
-use super::views::TrainView;
-use super::{Trainer, streams};
+use super::streams;
+use super::supervision::Supervision;
+use super::views::{TrainView, Views};
 use crate::Result;
-use crate::loss::exposure::{Affine, Exposures};
+use crate::gpu::Gpu;
+use crate::loss::exposure::Affine;
 use crate::splats::attributes::{AttributePlane, planes};
+use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::init::Initialization;
@@ -38,89 +44,108 @@ struct DepthSample {
     color: Vec3,
 }
 
-impl Trainer {
-    /// Whether the round after this step seeds: it is the first, and there are few Gaussians.
-    pub(super) fn seeds_at(&self, step: u64) -> bool {
-        let (sparse_threshold, count) =
-            (self.config.density.sparse_threshold(), self.model.count());
-        let is_due = step == self.config.schedule.first_round();
-        is_due && count <= sparse_threshold && count < self.seeded_count()
-    }
+/// Whether the round after this step seeds: it is the first, and there are few Gaussians.
+pub(super) fn seeds_at(config: &TrainConfig, views: &Views, step: u64, count: usize) -> bool {
+    let is_due = step == config.schedule.first_round();
+    is_due && count <= config.density.sparse_threshold() && count < seeded_count(config, views)
+}
 
-    /// The number of Gaussians after that round.
-    pub(super) fn seeded_count(&self) -> usize {
-        let pixels = |view: &TrainView| Patch::from(&view.patch.camera).pixel_count();
-        let most = self.supervision.views.photographs().map(pixels).max().unwrap_or_default();
-        self.config.density.depth_seeding.min(most / MIN_PIXELS_EACH)
-    }
+/// The number of Gaussians after that round.
+pub(super) fn seeded_count(config: &TrainConfig, views: &Views) -> usize {
+    let pixels = |view: &TrainView| Patch::from(&view.patch.camera).pixel_count();
+    let most = views.photographs().map(pixels).max().unwrap_or_default();
+    config.density.depth_seeding.min(most / MIN_PIXELS_EACH)
+}
 
-    /// The number of Gaussians, or their number after a seeding that is still to come.
-    pub(super) fn count_once_filled(&self) -> usize {
-        let (count, first) = (self.model.count(), self.config.schedule.first_round());
-        let fills = self.step < first && self.seeds_at(first) && self.densifies_at(first);
-        if fills { self.seeded_count().max(count) } else { count }
-    }
+/// The number of Gaussians, of which there are `count`, after a seeding that is still to come.
+pub(super) fn count_once_seeded(
+    config: &TrainConfig,
+    clock: &Clock,
+    views: &Views,
+    count: usize,
+) -> usize {
+    let first = config.schedule.first_round();
+    let is_to_come = clock.step < first && clock.densifies_at(first);
+    let seeds = is_to_come && seeds_at(config, views, first, count);
+    if seeds { seeded_count(config, views).max(count) } else { count }
+}
 
-    /// Adds Gaussians until there are `wanted`.
-    pub(super) fn seed_depths(&mut self, wanted: usize) -> Result<()> {
-        let more = wanted.saturating_sub(self.model.count());
-        if more == 0 {
-            return Ok(());
-        }
-        let old = self.gaussians_in_frame()?;
-        // Non-finite parameters are reported by the next check.
-        if !old.means().iter().all(|mean| mean.is_finite()) {
-            return Ok(());
-        }
-        let depth_samples = self.depth_samples(&old, more)?;
-        let draws = Stream::new(self.config.seed, streams::FILL);
-        let mut order: Vec<usize> = (0..depth_samples.len()).collect();
-        order.sort_by_key(|&i| draws.bits(i as u64));
-        let picked: Vec<DepthSample> =
-            order.into_iter().take(more).map(|i| depth_samples[i]).collect();
-        tracing::info!(
-            "step {}: {} Gaussians seeded at rendered depths, in addition to {}",
-            self.step,
-            picked.len(),
-            old.count
-        );
-        let filled = joined(&old, &picked, &self.config.start)?;
-        let (in_use, frozen_columns) = (self.model.shape().sh_degree, self.config.frozen_columns());
-        let precision = &self.config.precision;
-        self.model = TrainedModel::upload(&self.gpu, &filled, in_use, precision, frozen_columns)?;
-        Ok(())
+/// Adds Gaussians to the model until there are `wanted`.
+pub(super) fn seed_depths(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    supervision: &Supervision,
+    model: &mut TrainedModel,
+    step: u64,
+    wanted: usize,
+) -> Result<()> {
+    let more = wanted.saturating_sub(model.count());
+    if more == 0 {
+        return Ok(());
     }
+    let old = model.gaussians.download(gpu)?;
+    // Non-finite parameters are reported by the next check.
+    if !old.means().iter().all(|mean| mean.is_finite()) {
+        return Ok(());
+    }
+    let sampler = Sampler { gpu, supervision, lamp: model.renderer.lamp()? };
+    let depth_samples = sampler.samples(config, &old, more)?;
+    let draws = Stream::new(config.seed, streams::FILL);
+    let mut order: Vec<usize> = (0..depth_samples.len()).collect();
+    order.sort_by_key(|&i| draws.bits(i as u64));
+    let picked: Vec<DepthSample> = order.into_iter().take(more).map(|i| depth_samples[i]).collect();
+    tracing::info!(
+        "step {step}: {} Gaussians seeded at rendered depths, in addition to {}",
+        picked.len(),
+        old.count
+    );
+    let filled = joined(&old, &picked, &config.start)?;
+    let (in_use, frozen_columns) = (model.gaussians.shape().sh_degree, config.frozen_columns());
+    model.gaussians =
+        TrainedGaussians::upload(gpu, &filled, in_use, &config.precision, frozen_columns)?;
+    Ok(())
+}
 
+/// Samples training views at the depths of Gaussians.
+struct Sampler<'a> {
+    gpu: &'a Gpu,
+    supervision: &'a Supervision,
+    /// Whose light is not in the colours of samples.
+    lamp: Option<Lamp>,
+}
+
+impl Sampler<'_> {
     /// Samples of some views, about [`PIXELS_EACH`] times `more`.
-    fn depth_samples(&self, gaussians: &Gaussians, more: usize) -> Result<Vec<DepthSample>> {
+    fn samples(
+        &self,
+        config: &TrainConfig,
+        gaussians: &Gaussians,
+        more: usize,
+    ) -> Result<Vec<DepthSample>> {
         let settings = RenderSettings {
             shape: 0.into(),
             raw_colors: true,
             rest: StorageFormat::Single,
             lamp: None,
-            ..self.config.render_settings()
+            ..config.render_settings()
         };
-        let mut renderer = Renderer::new(&self.gpu, settings)?;
-        let exposures = self.supervision.exposures.as_ref().map(Exposures::affines).transpose()?;
-        let lamp = self.renderer.lamp()?;
-        let count = self.supervision.views.photographs().count();
-        let views = self.supervision.views.photographs().step_by(count.div_ceil(VIEWS).max(1));
+        let mut renderer = Renderer::new(self.gpu, settings)?;
+        let Supervision { views, targets, .. } = self.supervision;
+        let exposures = self.supervision.affines()?;
+        let count = views.photographs().count();
+        let sampled = views.photographs().step_by(count.div_ceil(VIEWS).max(1));
         let pixels = PIXELS_EACH * more / count.clamp(1, VIEWS);
         let mut depth_samples = vec![];
-        for view in views {
+        for view in sampled {
             let camera = coarse(&view.patch.camera, pixels);
             let depths = self.depths(&mut renderer, gaussians, &camera)?;
-            let target = self
-                .supervision
-                .views
-                .picture(&self.supervision.targets.pseudo_gt, view.photograph)?;
-            let exposure =
-                exposures.as_ref().and_then(|exposures| exposures.get(view.photograph.0));
+            let target = views.picture(&targets.pseudo_gt, view.photograph)?;
+            let exposure = exposures.get(view.photograph.0);
             let neutral = exposure.map(Affine::inverse).map(|inverse| inverse.applied(&target));
             let target = neutral.unwrap_or(target).resized(camera.width, camera.height);
             let mask = self.mask_of(view)?.map(|mask| mask.resized(camera.width, camera.height));
             let mut samples = seen(&camera, &depths, &target, mask.as_ref());
-            if let Some(lamp) = &lamp {
+            if let Some(lamp) = &self.lamp {
                 for sample in &mut samples {
                     let in_view = camera.view_from_world.transform_point3(sample.position);
                     sample.color = lamp.unlit(sample.color, in_view);
@@ -149,18 +174,18 @@ impl Trainer {
         }
         renderer.reserve(bare.count, [camera])?;
         let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
-        renderer.render_image(&bare.upload(&self.gpu)?, camera, &options)
+        renderer.render_image(&bare.upload(self.gpu)?, camera, &options)
     }
 
     /// The mask of a view, as an image of three equal channels.
     fn mask_of(&self, view: &TrainView) -> Result<Option<Image>> {
-        if self.supervision.masks.of_view(view.id).is_none() {
+        let Supervision { views, masks, .. } = self.supervision;
+        if masks.of_view(view.id).is_none() {
             return Ok(None);
         }
-        let views = self.supervision.views.of_photographs(view.photograph..=view.photograph);
+        let views = views.of_photographs(view.photograph..=view.photograph);
         let weights = |view: &TrainView| {
-            let weights =
-                self.supervision.masks.of_view(view.id).map(|weights| self.gpu.read(weights));
+            let weights = masks.of_view(view.id).map(|weights| self.gpu.read(weights));
             Ok(weights.transpose()?.unwrap_or_default().repeat(3))
         };
         let parts = views.iter().map(weights).collect::<Result<_>>()?;

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use nightsplat_core::hash::{self, Hasher};
 use toml::Value;
 
-use super::TrainConfig;
+use super::config::TrainConfig;
 use super::layers::values;
 use crate::Result;
 

@@ -6,22 +6,12 @@ use std::path::{Path, PathBuf};
 use nightsplat_photographs::dataset::{Dataset, LoadOptions, Photograph, View};
 use nightsplat_photographs::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
 
+use super::config::TrainConfig;
 use super::diagnose::exposures_at_points;
 use super::views::Views;
-use super::{TrainConfig, Trainer};
 use crate::loss::exposure::{Affine, table};
 use crate::targets::Targets;
 use crate::{Error, Result};
-
-impl Trainer {
-    /// The exposure of each training view, by name; `None` if exposures are not learned.
-    #[doc(hidden)]
-    pub fn exposures(&self) -> Result<Option<Vec<(String, Affine)>>> {
-        let Some(exposures) = &self.supervision.exposures else { return Ok(None) };
-        let names = self.supervision.views.names().map(str::to_owned);
-        Ok(Some(names.zip(exposures.affines()?).collect()))
-    }
-}
 
 /// The stops of linear light by which photographs are brighter than the mean of the training views, by view: from the
 /// table of the configuration or the dataset, else from EXIF. Empty where no exposure is known, or all are alike.

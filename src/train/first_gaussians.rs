@@ -10,8 +10,9 @@ use nightsplat_core::random::Stream;
 use nightsplat_photographs::dataset::{Dataset, Point, View};
 use nightsplat_photographs::image::Image;
 
+use super::config::TrainConfig;
+use super::streams;
 use super::views::{ImageKind, TrainView, TrainingPhotograph, Views};
-use super::{TrainConfig, streams};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::NetworkVariant;

@@ -2,16 +2,13 @@
 
 use glam::UVec2;
 use nightsplat_core::camera::Camera;
-use nightsplat_core::random::Stream;
-use nightsplat_photographs::dataset::Dataset;
 
-use super::memory::MARGIN;
+use super::depth_seeding::{seed_depths, seeded_count, seeds_at};
+use super::model::{Density, MARGIN, TrainedModel};
 use super::rendered::Rendered;
-use super::target_views::TargetViews;
-use super::{TrainConfig, Trainer, streams};
+use super::trainer::Trainer;
 use crate::Result;
-use crate::gpu::Gpu;
-use crate::splats::densify::{Densifier, DensifyReport, DensifySettings, DensityControl, Round};
+use crate::splats::densify::{DensifyReport, Round};
 use crate::splats::render::RenderOptions;
 use crate::splats::scene::GaussianSlice;
 
@@ -19,69 +16,50 @@ use crate::splats::scene::GaussianSlice;
 /// whole may lose somewhat more.
 const MAX_LOST: f64 = 0.2;
 
-/// The state of density control.
-#[derive(Debug)]
-pub(super) struct Growth {
-    pub(super) densifier: Densifier,
-    /// Training views on which the cost of a round is measured; empty if it is not.
-    pub(super) probes: TargetViews,
-    /// Whether the end of growth for lack of capacity was logged.
-    pub(super) has_logged_capacity: bool,
-}
-
 impl Trainer {
-    /// Whether density control acts after this step: not in the cooldown, nor within the last interval of the run.
-    pub(super) fn densifies_at(&self, step: u64) -> bool {
-        let schedule = &self.config.schedule;
-        let is_in_time = step + schedule.densify_interval <= self.config.steps;
-        schedule.densifies_at(step)
-            && is_in_time
-            && step <= self.cooldown_begin()
-            && !self.config.freezes_geometry()
-    }
-
     /// Density control after the last step, whose view had this many intersections.
     pub(super) fn control_density(&mut self, intersections: u32) -> Result<()> {
         let _phase = tracing::info_span!("density control").entered();
-        let rounds_left = match self.config.density.control {
-            DensityControl::Conserving => {
-                self.config.schedule.rounds_left(self.step, self.cooldown_begin())
-            }
-            DensityControl::Paper => 1,
+        let step = self.clock.step;
+        let rounds_left = if self.config.density.control.strategy().spreads_growth {
+            self.config.schedule.rounds_left(step, self.clock.cooldown_begin())
+        } else {
+            1
         };
         let grown = self.growth_limit()?.max(self.model.count());
         let (capacity, why) = self.capacity(intersections);
         let most = capacity.min(grown);
-        if self.seeds_at(self.step) {
-            self.seed_depths(self.seeded_count().min(most))?;
-            self.convergence.decisions.density_due = None;
-            return self.reserve();
+        let Self { gpu, config, supervision, model, clock, .. } = self;
+        if seeds_at(config, &supervision.views, step, model.count()) {
+            let wanted = seeded_count(config, &supervision.views).min(most);
+            seed_depths(gpu, config, supervision, model, step, wanted)?;
+            clock.decisions.density_due = None;
+            return model.reserve(&supervision.views);
         }
-        let round = Round { step: self.step, rounds_left, most };
-        let report = self.densify(round)?;
-        self.convergence.decisions.density_due = None;
-        if report.refused > 0
-            && capacity < self.config.max_gaussians
-            && !self.growth.has_logged_capacity
-        {
-            self.growth.has_logged_capacity = true;
+        let report = self.densify(Round { step, rounds_left, most })?;
+        self.clock.decisions.density_due = None;
+        let has_logged = &mut self.model.density.has_logged_capacity;
+        if report.refused > 0 && capacity < self.config.max_gaussians && !*has_logged {
+            *has_logged = true;
             tracing::warn!("growth stops at {capacity} Gaussians, {why}");
         }
-        self.reserve()
+        self.model.reserve(&self.supervision.views)
     }
 
     /// A round of density control with as many splits as the probes allow.
     fn densify(&mut self, round: Round) -> Result<DensifyReport> {
-        let options = RenderOptions { sh_degree: self.sh_degree(self.step), background: [0.0; 3] };
-        let affines = self.affines()?;
-        let Self { gpu, model, renderer, growth: Growth { densifier, probes, .. }, .. } = self;
+        let sh_degree = self.clock.sh_degree(self.clock.step);
+        let options = RenderOptions { sh_degree, background: [0.0; 3] };
+        let affines = self.supervision.affines()?;
+        let TrainedModel { gaussians, renderer, density, .. } = &mut self.model;
+        let Density { densifier, probes, .. } = density;
         let mut psnr = |gaussians: GaussianSlice<'_>| {
             let show = |camera: &Camera| Rendered::new(renderer, gaussians, camera, &options, None);
             Ok(probes.mean_psnr(&affines, show)?.map_or(0.0, |[colors, _]| colors))
         };
-        let before = psnr(model.gaussians.slice())?;
+        let before = psnr(gaussians.values.slice())?;
         let mut after = before;
-        let report = model.densify(gpu, densifier, round, |new| {
+        let report = gaussians.densify(&self.gpu, densifier, round, |new| {
             after = psnr(new)?;
             Ok(share_that_stays(before - after))
         })?;
@@ -89,31 +67,14 @@ impl Trainer {
         Ok(report)
     }
 
-    /// The largest number of Gaussians that fits, at least the present number, and the limiting resource. A view may
-    /// have twice as many intersections per Gaussian as the last one.
+    /// [`Memory::capacity`](super::memory::Memory::capacity) after a step whose view had this many intersections: the
+    /// largest may have twice as many per Gaussian and pixel.
     fn capacity(&self, intersections: u32) -> (usize, &'static str) {
         let pixels = |size: UVec2| f64::from(size.x) * f64::from(size.y);
         let largest = self.supervision.views.sizes().into_iter().map(pixels).fold(0.0, f64::max);
-        let shrunk = largest / pixels(self.view_of(self.step).size());
+        let shrunk = largest / pixels(self.view_of(self.clock.step).size());
         let met = MARGIN * shrunk * f64::from(intersections.max(1));
-        let count = self.model.count();
-        let each = met / count.max(1) as f64;
-        let bindable = f64::from(self.renderer.max_intersections()) / each;
-        let bindable = self.max_renderable().min(bindable as usize);
-        let bounds = [
-            (bindable, "the most that the device binds"),
-            (self.fitting_in_vram(each), "the most that fits in max_vram"),
-            (self.fitting_in_ram(each), "the most that fits in max_ram"),
-        ];
-        let (capacity, why) =
-            bounds.into_iter().min_by_key(|(capacity, _)| *capacity).unwrap_or(bounds[0]);
-        (capacity.max(count), why)
-    }
-
-    /// The limit of Gaussians from the setting and from the buffers that the renderer binds.
-    pub(super) fn max_renderable(&self) -> usize {
-        let renderable = self.config.render_settings().peak_gaussians(&self.gpu);
-        self.config.max_gaussians.min(renderable)
+        self.memory.capacity(&self.model, &self.clock, met)
     }
 }
 
@@ -123,22 +84,6 @@ fn share_that_stays(lost: f64) -> f64 {
     if lost > MAX_LOST { (0.9 * MAX_LOST / lost).powi(2) } else { 1.0 }
 }
 
-/// Density control in the frame, for the cameras of the training views.
-pub(super) fn densifier(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Densifier> {
-    let frame = config.frame.unwrap_or_default();
-    let cameras = dataset.train_views().map(|view| frame.camera(&view.camera));
-    let settings = DensifySettings {
-        control: config.density.control,
-        gradient_threshold: config.density.gradient_threshold,
-        split_scale: config.density.split_scale * config.extent_of(dataset) * frame.scale,
-        min_opacity: config.density.min_opacity,
-        max_gaussians: config.max_gaussians,
-        near: config.render_settings().near.into(),
-        seed: Stream::new(config.seed, streams::DENSITY).bits(0),
-    };
-    Densifier::new(gpu, settings, &cameras.collect::<Vec<_>>())
-}
-
 #[cfg(test)]
 mod tests {
     use std::path::{Path, PathBuf};
@@ -146,8 +91,9 @@ mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
     use crate::targets::Targets;
-    use crate::train::Preset;
     use crate::train::target_views::TargetViews;
+    use crate::train::{Preset, TrainConfig};
+    use nightsplat_photographs::dataset::Dataset;
     use nightsplat_synth::SyntheticOptions;
 
     /// The most dB that a round may cost the training views.
@@ -163,18 +109,19 @@ mod tests {
         let views = TargetViews::probes(&targets, &dataset, &frame, all).unwrap();
         let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
         let psnr = |trainer: &mut Trainer| {
-            let (degree, affines) = (trainer.sh_degree_in_use(), trainer.affines().unwrap());
-            let show = |camera: &Camera| trainer.render_of_degree(camera, degree);
+            let affines = trainer.supervision.affines().unwrap();
+            let degree = trainer.sh_degree_in_use();
+            let show = |camera: &Camera| trainer.model.render(camera, degree, None);
             let [colors, _] = views.mean_psnr(&affines, show).unwrap().unwrap();
             colors
         };
         let mut losses = vec![];
         while !trainer.has_ended() {
             trainer.train_steps(config.steps, &mut vec![]).unwrap();
-            let is_round = trainer.convergence.decisions.density_due.is_some();
+            let is_round = trainer.clock.decisions.density_due.is_some();
             let before = is_round.then(|| psnr(&mut trainer));
             trainer.control().unwrap();
-            losses.extend(before.map(|before| (trainer.step, before - psnr(&mut trainer))));
+            losses.extend(before.map(|before| (trainer.clock.step, before - psnr(&mut trainer))));
         }
         losses
     }

@@ -5,14 +5,13 @@ use std::collections::BTreeMap;
 use glam::DVec3;
 use nightsplat_photographs::dataset::{Dataset, Point, View};
 
-use super::LampRates;
+use super::config::{LampRates, TrainConfig};
 use super::encoding::LampToneLaw;
-use super::{Optimizer, TrainConfig, Trainer};
 use crate::Result;
 use crate::gpu::{Gpu, Recorder, Slice, SliceMut};
 use crate::kernels::lamp::LAMP_WIDTH;
 use crate::splats::lamp::Lamp;
-use crate::splats::optimizer::{AdamBuffers, Learnable, Moments};
+use crate::splats::optimizer::{Adam, AdamBuffers, Learnable, Moments};
 use crate::splats::render::{DeviceLamp, Renderer};
 use crate::targets::Targets;
 
@@ -66,38 +65,28 @@ impl Learnable for LearnedLamp<'_> {
 /// The prefix of its tensors in a checkpoint.
 pub(super) const LEARNED: &str = "lamp";
 
-impl Optimizer {
-    /// Records a step of the lamp, if one is learned.
-    pub(super) fn update_lamp(
+impl LampLearning {
+    /// Records a step of the renderer's lamp.
+    pub(super) fn update(
         &mut self,
+        adam: &Adam,
         pass: &mut Recorder<'_>,
         renderer: &mut Renderer,
         step: u64,
         factor: f64,
     ) -> Result<()> {
-        let Some((learning, (lamp, status))) = self.lamp.as_mut().zip(renderer.lamp_and_status())
-        else {
-            return Ok(());
-        };
+        let Some((lamp, status)) = renderer.lamp_and_status() else { return Ok(()) };
         // The gradients of the first steps, whose colours are not settled, would be Adam's measure of later ones.
-        let Some(step) = step.checked_sub(learning.rates.after).filter(|&step| step > 0) else {
+        let Some(step) = step.checked_sub(self.rates.after).filter(|&step| step > 0) else {
             return Ok(());
         };
         let DeviceLamp { numbers, gradients, .. } = lamp;
         let mut learned = LearnedLamp {
             numbers: numbers.slice_mut().range(0..LAMP_WIDTH as usize)?,
             gradients: gradients.slice(),
-            learning,
+            learning: self,
         };
-        self.adam.update(pass, step, factor, &mut learned, status)
-    }
-}
-
-impl Trainer {
-    /// The lamp as learned so far, in units of the dataset's world; `None` without one.
-    #[doc(hidden)]
-    pub fn lamp(&self) -> Result<Option<Lamp>> {
-        Ok(self.renderer.lamp()?.map(|lamp| lamp.scaled(1.0 / self.frame.scale)))
+        adam.update(pass, step, factor, &mut learned, status)
     }
 }
 

@@ -13,7 +13,7 @@ use nightsplat_photographs::tone::{OF_CURVE, ToneCurve};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-use super::TrainConfig;
+use super::config::TrainConfig;
 use super::settings::{SETTINGS, flat, number, setting, takes, unknown, value};
 use crate::{Error, Result};
 

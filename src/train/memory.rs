@@ -3,13 +3,19 @@
 //! Limits depend on counts alone, never on the current state of the system: growth stops at the same number of
 //! Gaussians in every run, resumed or not.
 
-use glam::UVec2;
+use std::sync::Arc;
+
 use nightsplat_core::camera::Patch;
 use serde::Serialize;
 
-use super::views::TrainView;
-use super::{CacheSize, Trainer};
+use super::cache::CacheSize;
+use super::clock::Clock;
+use super::config::TrainConfig;
+use super::depth_seeding::count_once_seeded;
+use super::model::{MARGIN, TrainedModel};
+use super::views::Views;
 use crate::Result;
+use crate::gpu::Gpu;
 use crate::splats::render::RenderOptions;
 use crate::splats::scene::{Layout, Shape};
 
@@ -23,8 +29,6 @@ const HOST_PLANE_SETS: f64 = 3.0;
 const HEADROOM: f64 = 1.5;
 /// The share of memory for activations that could be recomputed.
 const ACTIVATIONS: f64 = 0.25;
-/// How many times more intersections per Gaussian a view may have than the last one.
-pub(super) const MARGIN: f64 = 2.0;
 
 /// The estimated memory of a training, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -43,37 +47,51 @@ pub struct MemoryEstimate {
     pub peak_host: u64,
 }
 
-impl Trainer {
-    /// Reserves the renderer's memory for every view.
-    pub(super) fn reserve(&mut self) -> Result<()> {
-        let Self { model, supervision, renderer, .. } = self;
-        let sizes = supervision.views.all().iter().map(TrainView::size);
-        renderer.reserve_sizes(model.count(), model.capacity(), sizes)
+/// The memory of a run, and the limits of its growth.
+#[derive(Debug)]
+pub(super) struct Memory {
+    gpu: Gpu,
+    config: Arc<TrainConfig>,
+    /// Bytes on the device that do not depend on the numbers of Gaussians and intersections.
+    fixed_bytes: f64,
+}
+
+impl Memory {
+    /// The memory of a run whose model has just been made.
+    pub(super) fn new(gpu: &Gpu, config: Arc<TrainConfig>, model: &TrainedModel) -> Self {
+        gpu.free_unused();
+        let planes = PerGaussian::new(&config, model, model.gaussians.shape()).model;
+        let in_model = model.gaussians.capacity() as f64 * planes;
+        let (in_use, in_renderer) = (gpu.memory_in_use(), model.renderer.reserved_bytes());
+        let fixed_bytes = (in_use as f64 - in_model - in_renderer as f64).max(0.0);
+        Self { gpu: gpu.clone(), config, fixed_bytes }
     }
 
     /// Estimates the memory of the training from its present memory and its largest view.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
-    pub fn memory_estimate(&mut self) -> Result<MemoryEstimate> {
-        let met = f64::from(self.intersections_of_largest_view()?);
-        let (per, count) = (self.per_gaussian(), self.model.count());
-        let peak_gaussians = self.peak_gaussians(met);
+    pub(super) fn estimate(
+        &self,
+        model: &mut TrainedModel,
+        clock: &Clock,
+        views: &Views,
+    ) -> Result<MemoryEstimate> {
+        let met = f64::from(intersections_of_largest_view(model, views)?);
+        let (per, count) = (self.per_gaussian(model, clock), model.count());
+        let peak_gaussians = self.peak_gaussians(model, clock, views, met);
         let most = peak_gaussians as f64;
-        let reserved = f64::from(self.renderer.intersection_capacity());
-        let device = self.fixed_bytes
-            + per.steady(self.model.capacity() as f64)
-            + self.intersection_bytes(reserved);
+        let (reserved, capacity) =
+            (f64::from(model.renderer.intersection_capacity()), model.gaussians.capacity() as f64);
+        let device = self.fixed_bytes + per.steady(capacity) + intersection_bytes(model, reserved);
         let intersections = reserved.max(met_by(most, met, count as f64));
-        let grown = per.growing_to(count as f64, self.model.capacity() as f64, most);
-        let peak_device = (self.fixed_bytes + self.intersection_bytes(intersections) + grown)
+        let grown = per.growing_to(count as f64, capacity, most);
+        let peak_device = (self.fixed_bytes + intersection_bytes(model, intersections) + grown)
             .max(device)
             .max(self.gpu.peak_memory() as f64);
+        let host_plane = self.host_plane(model);
         let host = |gaussians: f64, device: f64| {
             // A software device's buffers are in the process's memory.
             let still_to_come = (device - self.gpu.memory_in_use() as f64).max(0.0);
             let shared = if self.gpu.properties().is_cpu { still_to_come } else { 0.0 };
-            resident().unwrap_or(PROGRAM) + shared + HOST_PLANE_SETS * self.host_plane() * gaussians
+            resident().unwrap_or(PROGRAM) + shared + HOST_PLANE_SETS * host_plane * gaussians
         };
         Ok(MemoryEstimate {
             gaussians: count,
@@ -85,120 +103,112 @@ impl Trainer {
         })
     }
 
-    /// The intersections of the first Gaussians in the largest view, for which memory is then reserved.
-    fn intersections_of_largest_view(&mut self) -> Result<u32> {
-        let largest = self
-            .supervision
-            .views
-            .all()
-            .iter()
-            .map(|view| view.patch)
-            .max_by_key(Patch::pixel_count);
-        let Some(patch) = largest else { return Ok(0) };
-        let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
-        self.renderer.render_patch(&self.model.gaussians, &patch, &options)?;
-        self.renderer.intersections()
-    }
-
     /// The largest number of Gaussians that the run can reach, by its limits and its rounds of growth.
-    fn peak_gaussians(&self, met: f64) -> usize {
-        let (count, interval) = (self.model.count(), self.config.schedule.densify_interval.max(1));
-        let rounds = (self.step / interval + 1..=self.config.steps / interval)
-            .filter(|round| self.densifies_at(round * interval));
+    fn peak_gaussians(
+        &self,
+        model: &TrainedModel,
+        clock: &Clock,
+        views: &Views,
+        met: f64,
+    ) -> usize {
+        let (count, interval) = (model.count(), self.config.schedule.densify_interval.max(1));
+        let rounds = (clock.step / interval + 1..=self.config.steps / interval)
+            .filter(|round| clock.densifies_at(round * interval));
         // A round at most doubles the Gaussians.
-        let filled = self.count_once_filled();
+        let filled = count_once_seeded(&self.config, clock, views, count);
         let doubled = (0..rounds.count()).try_fold(filled, |count, _| count.checked_mul(2));
-        let limit = self.max_renderable();
         let each = MARGIN * met / count.max(1) as f64;
-        let limit = limit.min(self.fitting_in_vram(each)).min(self.fitting_in_ram(each));
-        limit.min(doubled.unwrap_or(usize::MAX)).max(count)
+        self.max_renderable()
+            .min(self.fitting_in_vram(model, clock, each))
+            .min(self.fitting_in_ram(model, clock, each))
+            .min(doubled.unwrap_or(usize::MAX))
+            .max(count)
     }
 
-    /// Keeps the activations that the denoiser's backward pass would otherwise recompute, within their share of the
-    /// memory.
-    pub(super) fn keep_activations(&mut self, sizes: &[UVec2]) -> Result<()> {
-        let most = (ACTIVATIONS * self.max_bytes()) as u64;
-        match &mut self.supervision.networks {
-            Some(terms) => terms.keep_activations(sizes, most),
-            None => Ok(()),
-        }
+    /// The largest number of Gaussians that fits, at least the present number, and the limiting resource. `met`: the
+    /// most intersections of a view with the present number.
+    pub(super) fn capacity(
+        &self,
+        model: &TrainedModel,
+        clock: &Clock,
+        met: f64,
+    ) -> (usize, &'static str) {
+        let count = model.count();
+        let each = met / count.max(1) as f64;
+        let bindable = f64::from(model.renderer.max_intersections()) / each;
+        let bindable = self.max_renderable().min(bindable as usize);
+        let bounds = [
+            (bindable, "the most that the device binds"),
+            (self.fitting_in_vram(model, clock, each), "the most that fits in max_vram"),
+            (self.fitting_in_ram(model, clock, each), "the most that fits in max_ram"),
+        ];
+        let (capacity, why) =
+            bounds.into_iter().min_by_key(|(capacity, _)| *capacity).unwrap_or(bounds[0]);
+        (capacity.max(count), why)
     }
 
-    /// The most bytes on the device, by the limits and its memory.
-    fn max_bytes(&self) -> f64 {
-        let device = self.gpu.properties();
-        let most = |CacheSize(bytes): CacheSize| bytes.min(device.memory);
-        let vram = self.config.max_vram.map_or(device.memory, most) as f64;
-        match self.config.max_ram {
-            Some(CacheSize(ram)) if device.is_cpu => vram.min((ram as f64 - PROGRAM).max(0.0)),
-            _ => vram,
-        }
-    }
-
-    /// Bytes on the device that do not depend on the numbers of Gaussians and intersections.
-    pub(super) fn measure_fixed_bytes(&self) -> f64 {
-        self.gpu.free_unused();
-        let model = self.model.capacity() as f64 * self.per_gaussian_of(self.model.shape()).model;
-        (self.gpu.memory_in_use() as f64 - model - self.renderer.reserved_bytes() as f64).max(0.0)
+    /// The limit of Gaussians from the setting and from the buffers that the renderer binds.
+    fn max_renderable(&self) -> usize {
+        let renderable = self.config.render_settings().peak_gaussians(&self.gpu);
+        self.config.max_gaussians.min(renderable)
     }
 
     /// The number of Gaussians, with `each` intersections, that fits the device's limit.
-    pub(super) fn fitting_in_vram(&self, each: f64) -> usize {
-        let limit = self.config.max_vram.map(|CacheSize(bytes)| bytes as f64);
-        limit.map_or(usize::MAX, |limit| self.fitting(limit - self.fixed_bytes, each, 0.0))
+    fn fitting_in_vram(&self, model: &TrainedModel, clock: &Clock, each: f64) -> usize {
+        let Some(CacheSize(limit)) = self.config.max_vram else { return usize::MAX };
+        let beside = intersection_bytes(model, each);
+        self.per_gaussian(model, clock).fitting(limit as f64 - self.fixed_bytes, model, beside)
     }
 
     /// The number of Gaussians that fits the host's limit: as copies and, on a software device, as device buffers.
-    pub(super) fn fitting_in_ram(&self, each: f64) -> usize {
+    fn fitting_in_ram(&self, model: &TrainedModel, clock: &Clock, each: f64) -> usize {
         let Some(CacheSize(limit)) = self.config.max_ram else { return usize::MAX };
-        let copies = HOST_PLANE_SETS * self.host_plane();
+        let copies = HOST_PLANE_SETS * self.host_plane(model);
         let rest = limit as f64 - PROGRAM;
         if self.gpu.properties().is_cpu {
-            return self.fitting(rest - self.fixed_bytes, each, copies);
+            let beside = copies + intersection_bytes(model, each);
+            let per = self.per_gaussian(model, clock);
+            return per.fitting(rest - self.fixed_bytes, model, beside);
         }
         (rest / copies).max(0.0) as usize
     }
 
-    /// The number of Gaussians that fits in `bytes`, including growth and saving, with `more` bytes each.
-    fn fitting(&self, bytes: f64, each: f64, more: f64) -> usize {
-        let (per, beside) = (self.per_gaussian(), more + self.intersection_bytes(each));
-        let saved = bytes / (per.saving(1.0) + beside);
-        // The present buffers may have 1.5 times the capacity.
-        let before = HEADROOM * self.model.count() as f64;
-        let grown = (bytes - per.growing(before, 0.0)) / (per.growing(0.0, 1.0) + beside);
-        saved.min(grown).max(0.0) as usize
-    }
-
-    fn intersection_bytes(&self, intersections: f64) -> f64 {
-        intersections * self.renderer.bytes_per_intersection() as f64
-    }
-
     /// Bytes per Gaussian once the highest SH degree is in use.
-    fn per_gaussian(&self) -> PerGaussian {
-        let now = self.model.shape();
-        let sh_degree = self.sh_degree(self.config.steps).max(now.sh_degree);
-        self.per_gaussian_of(Shape { sh_degree, ..now })
+    fn per_gaussian(&self, model: &TrainedModel, clock: &Clock) -> PerGaussian {
+        let now = model.gaussians.shape();
+        let sh_degree = clock.sh_degree(self.config.steps).max(now.sh_degree);
+        PerGaussian::new(&self.config, model, Shape { sh_degree, ..now })
     }
 
     /// Host bytes per Gaussian of one copy, with every SH degree.
-    fn host_plane(&self) -> f64 {
-        self.per_gaussian_of(self.model.whole_shape()).plane
+    fn host_plane(&self, model: &TrainedModel) -> f64 {
+        PerGaussian::new(&self.config, model, model.gaussians.whole_shape()).plane
     }
+}
 
-    fn per_gaussian_of(&self, shape: Shape) -> PerGaussian {
-        let layout = Layout { shape, ..self.model.gaussians.layout };
-        let columns = [layout.floats().columns, layout.words()];
-        let [plane, parameters] = columns.map(|columns| (columns * size_of::<f32>()) as f64);
-        // Gradients and moments are planes, without the columns that are not trained.
-        let planes = (1 + self.model.moments.planes().len()) as f64;
-        let frozen = f64::from(self.config.frozen_columns()) * size_of::<f32>() as f64;
-        PerGaussian {
-            plane,
-            model: parameters + planes * (plane - frozen) + STATISTICS,
-            working: (self.renderer.bytes_per_gaussian()
-                + self.growth.densifier.bytes_per_gaussian()) as f64,
-        }
-    }
+/// The most bytes for activations that could be recomputed, by the limits of memory and the device's.
+pub(super) fn activation_bytes(gpu: &Gpu, config: &TrainConfig) -> u64 {
+    let device = gpu.properties();
+    let most = |CacheSize(bytes): CacheSize| bytes.min(device.memory);
+    let vram = config.max_vram.map_or(device.memory, most) as f64;
+    let bytes = match config.max_ram {
+        Some(CacheSize(ram)) if device.is_cpu => vram.min((ram as f64 - PROGRAM).max(0.0)),
+        _ => vram,
+    };
+    (ACTIVATIONS * bytes) as u64
+}
+
+/// The intersections of the first Gaussians in the largest view, for which memory is then reserved.
+fn intersections_of_largest_view(model: &mut TrainedModel, views: &Views) -> Result<u32> {
+    let patches = views.all().iter().map(|view| view.patch);
+    let Some(patch) = patches.max_by_key(Patch::pixel_count) else { return Ok(0) };
+    let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
+    model.renderer.render_patch(&model.gaussians.values, &patch, &options)?;
+    model.renderer.intersections()
+}
+
+fn intersection_bytes(model: &TrainedModel, intersections: f64) -> f64 {
+    intersections * model.renderer.bytes_per_intersection() as f64
 }
 
 /// Device memory per Gaussian, in bytes.
@@ -212,6 +222,32 @@ struct PerGaussian {
 }
 
 impl PerGaussian {
+    /// For Gaussians of this shape.
+    fn new(config: &TrainConfig, model: &TrainedModel, shape: Shape) -> Self {
+        let TrainedModel { gaussians, renderer, density, .. } = model;
+        let layout = Layout { shape, ..gaussians.values.layout };
+        let columns = [layout.floats().columns, layout.words()];
+        let [plane, parameters] = columns.map(|columns| (columns * size_of::<f32>()) as f64);
+        // Gradients and moments are planes, without the columns that are not trained.
+        let planes = (1 + gaussians.moments.planes().len()) as f64;
+        let frozen = f64::from(config.frozen_columns()) * size_of::<f32>() as f64;
+        let densifier = &density.densifier;
+        Self {
+            plane,
+            model: parameters + planes * (plane - frozen) + STATISTICS,
+            working: (renderer.bytes_per_gaussian() + densifier.bytes_per_gaussian()) as f64,
+        }
+    }
+
+    /// The number of Gaussians that fits in `bytes`, including growth and saving, with `beside` bytes more each.
+    fn fitting(&self, bytes: f64, model: &TrainedModel, beside: f64) -> usize {
+        let saved = bytes / (self.saving(1.0) + beside);
+        // The present buffers may have 1.5 times the capacity.
+        let before = HEADROOM * model.count() as f64;
+        let grown = (bytes - self.growing(before, 0.0)) / (self.growing(0.0, 1.0) + beside);
+        saved.min(grown).max(0.0) as usize
+    }
+
     /// Bytes of `count` Gaussians in training.
     fn steady(&self, count: f64) -> f64 {
         count * (self.model + self.working)

@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::UVec2;
 use nightsplat_photographs::image::Image;
 
-use super::ModelConfig;
+use super::parts::ModelConfig;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::networks::crop::{CropKernels, PaddedCrop};
 use crate::networks::{self, Denoiser, Parameters, Tonemapper};

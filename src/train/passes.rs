@@ -3,12 +3,13 @@
 use nightsplat_core::random::Stream;
 use nightsplat_photographs::dataset::Dataset;
 
-use super::{Background, TrainConfig, growth, streams};
+use super::config::{Background, TrainConfig};
+use super::streams;
 use crate::Result;
 use crate::gpu::Gpu;
 use crate::loss::Losses;
 use crate::splats::batches::GradientKind;
-use crate::splats::densify::Densifier;
+use crate::splats::densify::{Densifier, DensifySettings};
 use crate::splats::optimizer::{Adam, FiniteCheck};
 use crate::splats::render::{RenderSettings, Renderer};
 use crate::splats::scene::Shape;
@@ -39,7 +40,7 @@ impl TrainKernels {
             adam: Adam::with_frozen(gpu, config.frozen_columns())?,
             finite: FiniteCheck::new(gpu)?,
             floor: floor(gpu, config, dataset)?,
-            densifier: growth::densifier(gpu, config, dataset)?,
+            densifier: densifier(gpu, config, dataset)?,
         })
     }
 }
@@ -53,6 +54,22 @@ fn floor(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Option<Sm
     let frame = config.frame.unwrap_or_default();
     let cameras = dataset.train_views().map(|view| frame.camera(&view.camera));
     Ok(Some(SmoothingFloor::new(gpu, variance, near, &cameras.collect::<Vec<_>>())?))
+}
+
+/// Density control in the frame, for the cameras of the training views.
+fn densifier(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Densifier> {
+    let frame = config.frame.unwrap_or_default();
+    let cameras = dataset.train_views().map(|view| frame.camera(&view.camera));
+    let settings = DensifySettings {
+        control: config.density.control,
+        gradient_threshold: config.density.gradient_threshold,
+        split_scale: config.density.split_scale * config.extent_of(dataset) * frame.scale,
+        min_opacity: config.density.min_opacity,
+        max_gaussians: config.max_gaussians,
+        near: config.render_settings().near.into(),
+        seed: Stream::new(config.seed, streams::DENSITY).bits(0),
+    };
+    Densifier::new(gpu, settings, &cameras.collect::<Vec<_>>())
 }
 
 /// The SH degree of the first step.

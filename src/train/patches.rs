@@ -9,10 +9,9 @@ use glam::UVec2;
 use nightsplat_core::camera::{Camera, Patch};
 use nightsplat_photographs::image::Image;
 
-use super::config::MIN_PATCH;
-use super::memory::MARGIN;
+use super::config::{MIN_PATCH, TrainConfig};
+use super::model::{MARGIN, TrainedModel};
 use super::views::{ImageKind, TrainView, TrainingPhotograph, Views};
-use super::{TrainConfig, Trainer};
 use crate::gpu::Gpu;
 use crate::networks::{Denoiser, Tonemapper};
 use crate::targets::pseudo_gt::PseudoGt;
@@ -34,32 +33,29 @@ impl TrainConfig {
     }
 }
 
-impl Trainer {
-    /// A smaller patch size if the first Gaussians have too many intersections with the present one; `None` otherwise,
-    /// or if smaller patches do not help.
-    pub(super) fn fewer_patch_pixels(&mut self) -> Result<Option<u64>> {
+impl Views {
+    /// A smaller patch size if the first Gaussians of the model have too many intersections with the present one; `None`
+    /// otherwise, or if smaller patches do not help.
+    pub(super) fn fewer_patch_pixels(&self, model: &mut TrainedModel) -> Result<Option<u64>> {
         let of_photograph = |patch: &Patch| Patch::from(&patch.camera).pixel_count();
-        let patches =
-            || self.supervision.views.whole().iter().map(|view| (view.photograph, view.patch));
+        let patches = || self.whole().iter().map(|view| (view.photograph, view.patch));
         let largest = patches().max_by_key(|(_, patch)| of_photograph(patch));
         let Some((largest, _)) = largest else { return Ok(None) };
         let patches: Vec<Patch> = patches()
             .filter(|&(photograph, _)| photograph == largest)
             .map(|(_, patch)| patch)
             .collect();
-        let gaussians = self.model.gaussians.slice();
+        let TrainedModel { gaussians, renderer, .. } = model;
         let mut met = 0;
         for patch in &patches {
-            met = met.max(self.renderer.count_intersections(gaussians, patch)?);
+            met = met.max(renderer.count_intersections(gaussians.values.slice(), patch)?);
         }
-        let share = f64::from(self.renderer.max_intersections()) / (MARGIN * f64::from(met));
+        let share = f64::from(renderer.max_intersections()) / (MARGIN * f64::from(met));
         let pixels = patches.iter().map(Patch::pixel_count).max().unwrap_or_default();
         let fewer = (share.min(1.0) * pixels as f64) as u64;
         Ok((share < 1.0 && fewer >= MIN_PATCH).then_some(fewer))
     }
-}
 
-impl Views {
     /// Logs the photographs that are trained in patches.
     pub(super) fn log_patches(&self, gpu: &Gpu) {
         let mut cut = self.photographs().filter(|view| !view.patch.is_whole());

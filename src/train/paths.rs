@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::TrainConfig;
+use super::config::TrainConfig;
 
 impl TrainConfig {
     /// The configuration with absolute paths, as a run records it.

@@ -5,9 +5,11 @@ use std::path::Path;
 use nightsplat_photographs::dataset::{Dataset, LoadOptions};
 use toml::Value;
 
+use super::config::TrainConfig;
 use super::diagnose::{Diagnosis, Plan};
 use super::layers::{Origin, Settings, SettingsLayer};
-use super::{Preset, TrainConfig, Trainer};
+use super::preset::Preset;
+use super::trainer::Trainer;
 use crate::gpu::Gpu;
 use crate::{Error, Result};
 

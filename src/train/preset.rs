@@ -8,7 +8,7 @@ use std::str::FromStr;
 use nightsplat_photographs::tone::{Tone, ToneCurve};
 use toml::Value;
 
-use super::TrainConfig;
+use super::config::TrainConfig;
 use super::layers::{Origin, SettingsLayer};
 use crate::{Error, Result};
 

@@ -5,9 +5,10 @@ use std::fmt::Write;
 use nightsplat_core::settings::Setting;
 use toml::Value;
 
+use super::config::TrainConfig;
 use super::layers::values;
+use super::preset::Preset;
 use super::settings::SETTINGS;
-use super::{Preset, TrainConfig};
 use crate::Result;
 
 /// The text of docs/settings.md: every setting and every preset.

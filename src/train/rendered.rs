@@ -3,7 +3,7 @@
 use nightsplat_core::camera::{Camera, Patch};
 use nightsplat_photographs::image::Image;
 
-use super::Networks;
+use super::networks::Networks;
 use crate::Result;
 use crate::splats::render::{RenderOptions, Renderer};
 use crate::splats::scene::{GaussianSlice, Layout};

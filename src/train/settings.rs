@@ -7,10 +7,12 @@ use nightsplat_core::settings::{Rule, Setting};
 use nightsplat_photographs::tone::ToneSettings;
 use toml::{Table, Value};
 
-use super::{
+use super::config::{
     AntialiasingConfig, CheckConfig, DensityConfig, ExposureConfig, LampConfig, LampRates,
-    ModelConfig, NetworkRates, PrecisionConfig, StopConfig, TrainConfig,
+    StopConfig, TrainConfig,
 };
+use super::parts::{ModelConfig, NetworkRates};
+use super::precision::PrecisionConfig;
 use crate::Error;
 use crate::loss::exposure::ExposureRates;
 use crate::loss::{ParameterWeights, Weights};

@@ -2,30 +2,32 @@
 
 use std::panic::resume_unwind;
 use std::path::Path;
+use std::sync::Arc;
 use std::thread::{self, ScopedJoinHandle};
 
 use glam::UVec2;
-use nightsplat_photographs::dataset::{Dataset, Fingerprint, Original};
+use nightsplat_photographs::dataset::{Dataset, Fingerprint, Original, Split};
 use nightsplat_photographs::scene_tone::SceneTone;
 
+use super::batching::MAX_STEPS;
 use super::cache::CacheSize;
+use super::clock::Clock;
+use super::config::TrainConfig;
 use super::context::Initial;
-use super::early_stopping::Convergence;
-use super::growth::Growth;
+use super::gaussians::TrainedGaussians;
 use super::lamp::{self, LampLearning};
 use super::masks::Masks;
-use super::model::TrainedModel;
+use super::memory::{Memory, activation_bytes};
+use super::model::{Density, Optimizer, TrainedModel};
 use super::passes::{TrainKernels, first_sh_degree};
-use super::submission::{MAX_STEPS, Submissions};
 use super::supervision::Supervision;
 use super::target_views::TargetViews;
 use super::terms::NetworkTerms;
+use super::trainer::{Scene, Trainer};
 use super::views::Views;
-use super::{Optimizer, TrainConfig, Trainer};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Exposures;
 use crate::loss::{LossLog, ParameterTerms};
-use crate::splats::densify::DensityControl;
 use crate::splats::scene::{FEATURES, Gaussians, Shape, ply};
 use crate::targets::Targets;
 use crate::{Error, Result};
@@ -83,13 +85,14 @@ impl Trainer {
         let _phase = tracing::info_span!("upload").entered();
         loop {
             let mut trainer = Self::begin(gpu, config.clone(), dataset, initial)?;
-            config.patch_pixels = match trainer.fewer_patch_pixels()? {
-                None => {
-                    trainer.supervision.views.log_patches(gpu);
-                    break Ok(trainer);
-                }
-                fewer => fewer,
-            };
+            config.patch_pixels =
+                match trainer.supervision.views.fewer_patch_pixels(&mut trainer.model)? {
+                    None => {
+                        trainer.supervision.views.log_patches(gpu);
+                        break Ok(trainer);
+                    }
+                    fewer => fewer,
+                };
             drop(trainer);
             gpu.free_unused();
         }
@@ -132,7 +135,7 @@ impl Trainer {
         let views = Views::upload(&targets, dataset, &config)?;
         let sizes = views.sizes();
         let probes = probes(&targets, dataset, &config, &sizes)?;
-        let convergence = Convergence::new(&targets, dataset, &config)?;
+        let held_out = held_out(&targets, dataset, &config)?;
         if let Some(exposure) = targets.scene.model_exposure() {
             tracing::info!("{}", exposure.reason());
         }
@@ -185,7 +188,7 @@ impl Trainer {
         let photographs = if networks.is_some() { pictures } else { 0 };
         // A curve without an inverse has no law.
         let law = targets.scene.law().ok();
-        let supervision = Supervision {
+        let mut supervision = Supervision {
             views,
             targets,
             target: gpu.uninit("target", pictures)?,
@@ -197,37 +200,45 @@ impl Trainer {
             parameter_terms: ParameterTerms::new(gpu, config.loss, config.frozen_columns())?,
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MAX_STEPS as usize)?,
+            held_out,
         };
-        let learning = lamp.map(|_| LampLearning::new(gpu, config.lamp.rates)).transpose()?;
         let degree = initial.context.as_ref().map_or(0, Gaussians::sh_degree_in_use);
         let degree = degree.max(first_sh_degree(&config));
         let (precision, frozen_columns) = (&config.precision, config.frozen_columns());
-        let mut trainer = Self {
-            gpu: gpu.clone(),
-            fingerprint,
-            frame,
-            extent: config.extent_of(dataset) * frame.scale,
-            law,
-            step: 0,
-            supervision,
-            model: TrainedModel::upload(gpu, &gaussians, degree, precision, frozen_columns)?,
+        let learning = lamp.map(|_| LampLearning::new(gpu, config.lamp.rates)).transpose()?;
+        let mut model = TrainedModel {
+            gaussians: TrainedGaussians::upload(
+                gpu,
+                &gaussians,
+                degree,
+                precision,
+                frozen_columns,
+            )?,
             renderer,
             optimizer: Optimizer { adam, finite, floor, lamp: learning, checked: 0 },
-            growth: Growth { densifier, probes, has_logged_capacity: false },
-            convergence,
-            submissions: Submissions::default(),
-            fixed_bytes: 0.0,
-            config,
+            density: Density { densifier, probes, has_logged_capacity: false },
+            best: vec![],
         };
         // Given Gaussians may have SH degrees that the first step does not use.
-        trainer.renderer.set_sh_degree(trainer.model.shape().sh_degree)?;
+        model.renderer.set_sh_degree(model.gaussians.shape().sh_degree)?;
         if let Some(context) = &initial.context {
-            trainer.renderer.set_context(&given(context, &trainer.config)?)?;
+            model.renderer.set_context(&given(context, &config)?)?;
         }
-        trainer.reserve()?;
-        trainer.keep_activations(&sizes)?;
-        trainer.fixed_bytes = trainer.measure_fixed_bytes();
-        Ok(trainer)
+        model.reserve(&supervision.views)?;
+        if let Some(terms) = &mut supervision.networks {
+            terms.keep_activations(&sizes, activation_bytes(gpu, &config))?;
+        }
+        let extent = config.extent_of(dataset) * frame.scale;
+        let config = Arc::new(config);
+        Ok(Self {
+            gpu: gpu.clone(),
+            scene: Scene { fingerprint, frame, extent, law },
+            memory: Memory::new(gpu, Arc::clone(&config), &model),
+            clock: Clock::new(Arc::clone(&config), !supervision.held_out.is_empty()),
+            supervision,
+            model,
+            config,
+        })
     }
 }
 
@@ -243,6 +254,17 @@ fn given(gaussians: &Gaussians, config: &TrainConfig) -> Result<Gaussians> {
     Ok(gaussians.with_sh_degree(shape.sh_degree).to_frame(&config.frame.unwrap_or_default()))
 }
 
+/// The held-out views, by which a run stops early.
+fn held_out(targets: &Targets, dataset: &Dataset, config: &TrainConfig) -> Result<TargetViews> {
+    let frame = config.frame.unwrap_or_default();
+    let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
+    let held_out = TargetViews::new(targets, held_out, &frame)?;
+    if config.stop.views > 0 && held_out.is_empty() {
+        tracing::info!("every held-out view is black or masked: the run takes all its steps");
+    }
+    Ok(held_out)
+}
+
 /// Training views on which the cost of a round of density control is measured.
 const PROBES: usize = 8;
 /// Pixels of each; all take at most 100 MB of host memory.
@@ -254,7 +276,7 @@ fn probes(
     config: &TrainConfig,
     sizes: &[UVec2],
 ) -> Result<TargetViews> {
-    if config.density.control == DensityControl::Paper {
+    if !config.density.control.strategy().keeps_views {
         return Ok(TargetViews::default());
     }
     // At most as large as the views that steps render.

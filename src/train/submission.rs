@@ -8,76 +8,21 @@ use std::collections::VecDeque;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
-use super::views::{TrainView, TrainingView};
-use super::{NotFinite, StepReport, Trainer};
+use super::batching::StepBatching;
+use super::config::NotFinite;
+use super::model::TrainedModel;
+use super::supervision::Supervision;
+use super::trainer::{StepReport, Trainer};
+use super::views::TrainView;
 use crate::gpu::Download;
 use crate::loss::{LossLogDownload, StepLosses};
 use crate::splats::render::Status;
 use crate::{Error, Result};
 
-/// The most steps of a submission.
-pub(super) const MAX_STEPS: u64 = 64;
-/// The target time of a submission.
-const SUBMISSION: Duration = Duration::from_millis(50);
 /// The interval of reports.
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 /// The interval of checks for NaN, which read a hundredth of what Adam reads.
 const FINITE_STEPS: u64 = 50;
-/// The most submissions in flight: one runs, one waits.
-const IN_FLIGHT: usize = 2;
-/// The passes of slower steps are submitted one by one: Windows resets a device after two seconds of one submission.
-const SLOW_STEP: Duration = Duration::from_millis(500);
-
-/// The number of steps per submission, from the time of the last one.
-#[derive(Debug)]
-pub(super) struct StepBatching {
-    in_flight: usize,
-    /// A fixed number of steps, for tests.
-    steps: Option<u64>,
-    step: Duration,
-    /// The time of a step from which on its passes are submitted one by one.
-    slow_step: Duration,
-    last_done: Instant,
-}
-
-impl Default for StepBatching {
-    fn default() -> Self {
-        Self {
-            in_flight: IN_FLIGHT,
-            steps: None,
-            step: SUBMISSION,
-            slow_step: SLOW_STEP,
-            last_done: Instant::now(),
-        }
-    }
-}
-
-impl StepBatching {
-    /// The steps of the next submission.
-    fn steps(&self) -> u64 {
-        let fitting = SUBMISSION.as_secs_f64() / self.step.as_secs_f64().max(1e-6);
-        self.steps.unwrap_or(fitting as u64).clamp(1, MAX_STEPS)
-    }
-
-    fn is_slow(&self) -> bool {
-        self.step >= self.slow_step
-    }
-
-    /// Measures a finished submission, from when the device was free for it.
-    fn measure(&mut self, submitted: Instant, steps: u64) {
-        let done = Instant::now();
-        let took = done.duration_since(submitted.max(self.last_done));
-        (self.step, self.last_done) = (took / steps.max(1) as u32, done);
-    }
-}
-
-/// The state of submissions.
-#[derive(Debug, Default)]
-pub(super) struct Submissions {
-    pub(super) batching: StepBatching,
-    /// The error that ended the last call after finished steps.
-    pub(super) failed: Option<Error>,
-}
 
 /// Submitted steps.
 struct Submitted {
@@ -91,14 +36,13 @@ impl Trainer {
     /// Fixes the number of submissions in flight, and the steps of each; `None`: chosen by timing.
     #[doc(hidden)]
     pub fn set_batching(&mut self, in_flight: usize, steps: Option<u64>) {
-        self.submissions.batching =
-            StepBatching { in_flight: in_flight.max(1), steps, ..StepBatching::default() };
+        self.clock.submissions.batching = StepBatching::fixed(in_flight, steps);
     }
 
     /// Fixes the time of a step from which on its passes are submitted one by one.
     #[doc(hidden)]
     pub fn set_slow_step(&mut self, slow_step: Duration) {
-        self.submissions.batching.slow_step = slow_step;
+        self.clock.submissions.batching.slow_step = slow_step;
     }
 
     /// Trains up to `until`, up to the next step of density control, or for about half a second.
@@ -106,16 +50,16 @@ impl Trainer {
     /// If that fails after finished steps, these are reported first and the next call returns the error, so that
     /// reports match the model.
     pub(super) fn submit_steps(&mut self, until: u64) -> Result<Vec<StepReport>> {
-        if let Some(error) = self.submissions.failed.take() {
+        if let Some(error) = self.clock.submissions.failed.take() {
             return Err(error);
         }
         let mut reports = vec![];
         match self.train_interval(until, &mut reports) {
-            Err(error) if !reports.is_empty() => self.submissions.failed = Some(error),
+            Err(error) if !reports.is_empty() => self.clock.submissions.failed = Some(error),
             done => done?,
         }
         // Steps before a non-finite parameter are not reported.
-        if self.step >= self.optimizer.checked + FINITE_STEPS {
+        if self.clock.step >= self.model.optimizer.checked + FINITE_STEPS {
             self.check_finite()?;
         }
         Ok(reports)
@@ -131,28 +75,20 @@ impl Trainer {
     /// Trains up to `until`, up to the next step with an action due, or for about half a second.
     pub(super) fn train_steps(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
         self.allocate_sh_degree()?;
-        let (begin, mut next) = (Instant::now(), self.step + 1);
+        let (begin, mut next) = (Instant::now(), self.clock.step + 1);
         let until = until.min(self.last_step());
-        // Density control may change the number of Gaussians, and a higher SH degree their memory.
-        let rises = |step| self.sh_degree(step + 1) > self.sh_degree(step);
-        let changes = |&step: &u64| {
-            self.densifies_at(step)
-                || rises(step)
-                || self.decides_degree_at(step)
-                || self.scores_at(step)
-        };
-        let last = (next..until).find(changes).unwrap_or(until);
+        let last = (next..until).find(|&step| self.clock.pauses_at(step)).unwrap_or(until);
         let (mut in_flight, mut sent) = (VecDeque::new(), Ok(()));
         loop {
             while sent.is_ok()
                 && next <= last
-                && in_flight.len() < self.submissions.batching.in_flight
+                && in_flight.len() < self.clock.submissions.batching.in_flight
             {
                 let has_news = !(reports.is_empty() && in_flight.is_empty());
                 if has_news && begin.elapsed() > REPORT_INTERVAL {
                     break;
                 }
-                let steps = next..=last.min(next + self.submissions.batching.steps() - 1);
+                let steps = next..=last.min(next + self.clock.submissions.batching.steps() - 1);
                 // If one cannot be submitted, those before it still change the model.
                 sent = self.load_and_submit(steps).map(|submitted| {
                     next = submitted.steps.end() + 1;
@@ -165,34 +101,33 @@ impl Trainer {
                 break;
             }
         }
-        self.convergence.decisions.score_due = !reports.is_empty() && self.scores_at(self.step);
-        self.convergence.decisions.degree_due =
-            !reports.is_empty() && self.decides_degree_at(self.step);
-        if !reports.is_empty() && self.densifies_at(self.step) {
+        self.clock.decisions.score_due =
+            !reports.is_empty() && self.clock.scores_at(self.clock.step);
+        self.clock.decisions.degree_due =
+            !reports.is_empty() && self.clock.decides_degree_at(self.clock.step);
+        if !reports.is_empty() && self.clock.densifies_at(self.clock.step) {
             // The round is due whether or not there is memory for it.
-            self.convergence.decisions.density_due = Some(0);
-            self.convergence.decisions.density_due = Some(self.renderer.intersections()?);
+            self.clock.decisions.density_due = Some(0);
+            self.clock.decisions.density_due = Some(self.model.renderer.intersections()?);
         }
         sent
     }
 
     /// Performs the actions due after the last step. An action that fails leaves the model unchanged and stays due.
     pub(super) fn control(&mut self) -> Result<()> {
-        if self.convergence.decisions.score_due {
+        if self.clock.decisions.score_due {
             self.score_held_out()?;
-            self.convergence.decisions.score_due = false;
+            self.clock.decisions.score_due = false;
             // A run that has converged does not grow.
-            self.convergence
-                .decisions
-                .density_due
-                .take_if(|_| self.convergence.decisions.converged == Some(self.step));
+            let (step, decisions) = (self.clock.step, &mut self.clock.decisions);
+            decisions.density_due.take_if(|_| decisions.converged == Some(step));
         }
-        if let Some(intersections) = self.convergence.decisions.density_due {
+        if let Some(intersections) = self.clock.decisions.density_due {
             self.control_density(intersections)?;
         }
-        if self.convergence.decisions.degree_due {
+        if self.clock.decisions.degree_due {
             self.decide_degree()?;
-            self.convergence.decisions.degree_due = false;
+            self.clock.decisions.degree_due = false;
         }
         Ok(())
     }
@@ -205,8 +140,8 @@ impl Trainer {
 
     /// Checks every parameter of the Gaussians on the device.
     fn check_finite(&mut self) -> Result<()> {
-        self.optimizer.checked = self.step;
-        match self.model.first_not_finite(&self.gpu, &mut self.optimizer.finite)? {
+        self.model.optimizer.checked = self.clock.step;
+        match self.model.first_not_finite(&self.gpu)? {
             Some(at) => Err(self.not_finite("gaussians.parameters", at)),
             None => Ok(()),
         }
@@ -216,7 +151,7 @@ impl Trainer {
         let gpu = self.gpu.clone();
         let (first, mut downloads) = (*steps.start(), None);
         gpu.submit("steps", |pass| {
-            if self.submissions.batching.is_slow() {
+            if self.clock.submissions.batching.is_slow() {
                 pass.cut_between_passes();
             }
             self.supervision.log.clear(pass);
@@ -225,7 +160,7 @@ impl Trainer {
             }
             downloads = Some((
                 self.supervision.log.download(pass)?,
-                pass.download(self.renderer.status())?,
+                pass.download(self.model.renderer.status())?,
             ));
             Ok(())
         })?;
@@ -242,16 +177,16 @@ impl Trainer {
         let Submitted { steps, at, log, status } = submitted;
         let (log, status) = (log.wait()?, Status::from_words(&status.wait()?));
         let count = steps.end() - steps.start() + 1;
-        self.submissions.batching.measure(at, count);
+        self.clock.submissions.batching.measure(at, count);
         // Steps from the first failed one on have changed nothing.
         let done = log.iter().take(count as usize).take_while(|losses| losses.status == 0).count();
         // This flag is raised after the loss: by the step before the first one that saw it.
         let done = if status.gradient_not_finite { done.saturating_sub(1) } else { done };
-        let milliseconds =
-            self.submissions.batching.step.as_secs_f64() * 1e3 * count as f64 / done.max(1) as f64;
+        let milliseconds = self.clock.submissions.batching.step.as_secs_f64() * 1e3 * count as f64
+            / done.max(1) as f64;
         let losses = steps.zip(&log[..done]);
         reports.extend(losses.map(|(step, losses)| self.report(step, losses, milliseconds)));
-        self.step += done as u64;
+        self.clock.step += done as u64;
         if done == count as usize {
             return Ok(true);
         }
@@ -261,11 +196,11 @@ impl Trainer {
 
     /// Handles a raised flag before the step is redone.
     fn answer(&mut self, status: Status, losses: &StepLosses) -> Result<()> {
-        let step = self.step + 1;
+        let step = self.clock.step + 1;
         let view = || self.view_of(step).name.clone();
         if status.overflowed {
-            self.renderer.grow(status.intersections)?;
-            let renderer = &mut self.renderer;
+            self.model.renderer.grow(status.intersections)?;
+            let renderer = &mut self.model.renderer;
             return self.gpu.clone().run("clear_status", |pass| {
                 renderer.clear_status(pass);
                 Ok(())
@@ -273,7 +208,7 @@ impl Trainer {
         }
         if status.splats_per_tile > 0 {
             let view = format!("step {step}, view {}", view());
-            return Err(self.renderer.too_many_splats(view, status.splats_per_tile));
+            return Err(self.model.renderer.too_many_splats(view, status.splats_per_tile));
         }
         let what = match losses.first_not_finite() {
             Some(term) => term.name,
@@ -294,25 +229,21 @@ impl Trainer {
         if !self.supervision.views.leave_out(photograph) {
             return Ok(false);
         }
-        let Self { model, renderer, .. } = self;
-        self.gpu.clone().run("clear_status", |pass| {
+        let TrainedModel { gaussians, renderer, .. } = &mut self.model;
+        self.gpu.run("clear_status", |pass| {
             renderer.clear_status(pass);
             // Some Gaussians may have added to the statistics before the flag was raised.
-            pass.fill(&mut model.grad_norm_sums, 0);
-            pass.fill(&mut model.visit_counts, 0);
+            pass.fill(&mut gaussians.grad_norm_sums, 0);
+            pass.fill(&mut gaussians.visit_counts, 0);
             Ok(())
         })?;
         Ok(true)
     }
 
     /// The view of a step.
-    pub(super) fn view_id(&self, step: u64) -> TrainingView {
-        let level = self.config.schedule.resolution_level(step);
-        self.supervision.views.of_step(self.config.seed, step, level)
-    }
-
     pub(super) fn view_of(&self, step: u64) -> &TrainView {
-        self.supervision.views.get(self.view_id(step))
+        let Supervision { views, .. } = &self.supervision;
+        views.get(views.at_step(&self.config, step))
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {

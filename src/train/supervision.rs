@@ -6,14 +6,15 @@
 //! render and features -> networks -> their terms -------------------------------------------------^
 //! ```
 
+use super::gaussians::TrainedGaussians;
 use super::masks::Masks;
-use super::model::TrainedModel;
 use super::networks::Networks;
+use super::target_views::TargetViews;
 use super::terms::{NetworkTerms, Photographs};
 use super::views::{TrainingView, Views};
 use crate::Result;
 use crate::gpu::{Buffer, Recorder};
-use crate::loss::exposure::Exposures;
+use crate::loss::exposure::{Affine, Exposures};
 use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, TermInputs};
 use crate::splats::optimizer::{Adam, Learnable};
 use crate::splats::render::Renderer;
@@ -37,12 +38,18 @@ pub(super) struct Supervision {
     /// The gradient with respect to the render, (channels, H, W).
     pub(super) d_render: Buffer<f32>,
     pub(super) log: LossLog,
+    pub(super) held_out: TargetViews,
 }
 
 impl Supervision {
     /// The networks, if the model has any.
     pub(super) fn networks(&mut self) -> Option<&mut Networks> {
         self.networks.as_mut().map(|terms| &mut terms.networks)
+    }
+
+    /// The exposure of every training photograph; none if exposures are not learned.
+    pub(super) fn affines(&self) -> Result<Vec<Affine>> {
+        self.exposures.as_ref().map_or_else(|| Ok(vec![]), Exposures::affines)
     }
 
     /// Records the loss terms of a step, in a slot of the log, and their gradient with respect to the render.
@@ -92,17 +99,17 @@ impl Supervision {
         masks.hide(pass, id, size, channels, d_render)
     }
 
-    /// Records the terms on parameters, which add to the gradients of the model.
+    /// Records the terms on parameters, which add to the gradients of the Gaussians.
     pub(super) fn regularise(
         &mut self,
         pass: &mut Recorder<'_>,
-        model: &mut TrainedModel,
+        gaussians: &mut TrainedGaussians,
         renderer: &mut Renderer,
         slot: u32,
     ) -> Result<()> {
         let Some(terms) = &mut self.parameter_terms else { return Ok(()) };
         let (_, status) = renderer.render_and_status();
-        model.record_terms(pass, terms, &mut LogSlot { log: &mut self.log, slot, status })
+        gaussians.record_terms(pass, terms, &mut LogSlot { log: &mut self.log, slot, status })
     }
 
     /// Records Adam's step of the learned parameters other than the Gaussians.

@@ -5,16 +5,14 @@ use nightsplat_core::camera::{Camera, TrainingFrame};
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::{Image, Mask};
 use nightsplat_photographs::metrics::{Scores, psnr_of_counted};
-use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{LuminanceHistogram, is_black};
 
-use super::Trainer;
 use super::rendered::Rendered;
-use super::terms::NetworkTerms;
-use super::views::{ImageKind, TrainingPhotograph};
+use super::views::{ImageKind, TrainingPhotograph, Views};
 use crate::Result;
-use crate::loss::exposure::{Affine, Exposures};
+use crate::loss::exposure::Affine;
 use crate::targets::Targets;
+use crate::targets::pseudo_gt::PseudoGt;
 
 /// Views with their targets.
 #[derive(Debug, Default)]
@@ -75,6 +73,20 @@ impl TargetViews {
             probes.extend(of_view.into_iter().map(shrunk));
         }
         Ok(Self(probes))
+    }
+
+    /// Training views, evenly spread, with their targets.
+    pub(super) fn of_training(views: &Views, pseudo_gt: &PseudoGt) -> Result<Self> {
+        const MOST: usize = 8;
+        let whole = views.whole();
+        let some = whole.iter().step_by(whole.len().div_ceil(MOST).max(1)).map(|view| {
+            let target = views.read(pseudo_gt, std::slice::from_ref(view), ImageKind::Targets)?;
+            let UVec2 { x: width, y: height } = view.size();
+            let target = Image { width, height, data: target.concat() };
+            let (camera, photograph) = (view.patch.own_camera(), Some(view.photograph));
+            Ok(TargetView { camera, target, mask: None, photograph })
+        });
+        Ok(Self(some.collect::<Result<_>>()?))
     }
 
     /// The mean PSNR, dB, of colours and output of `render` for each camera; `None` without views. `affines` are the
@@ -159,101 +171,4 @@ impl TargetView {
 fn clamped(image: &Image) -> Image {
     let data = image.data.iter().map(|value| value.clamp(0.0, 1.0)).collect();
     Image { data, ..*image }
-}
-
-impl Trainer {
-    /// The curves of the photographs.
-    #[doc(hidden)]
-    pub fn scene(&self) -> &SceneTone {
-        &self.supervision.targets.scene
-    }
-
-    /// The mean PSNR, dB, of the Gaussians' colours on the held-out views against their targets; `None` without
-    /// held-out views.
-    #[doc(hidden)]
-    pub fn held_out_psnr(&mut self) -> Result<Option<f64>> {
-        self.held_out_psnr_of_degree(self.sh_degree(self.step))
-    }
-
-    /// [`Trainer::held_out_psnr`] with a given SH degree.
-    pub(super) fn held_out_psnr_of_degree(&mut self, sh_degree: u32) -> Result<Option<f64>> {
-        Ok(self.psnr_of_held_out(sh_degree)?.map(|[colors, _]| colors))
-    }
-
-    /// The mean PSNR, dB, of R_0 and of the output (R_K if the model has a denoiser); `None` if no view is held out.
-    fn psnr_of_held_out(&mut self, sh_degree: u32) -> Result<Option<[f64; 2]>> {
-        let views = std::mem::take(&mut self.convergence.held_out);
-        let affines = self.affines();
-        let scores = affines.and_then(|affines| {
-            views.mean_psnr(&affines, |camera| self.render_of_degree(camera, sh_degree))
-        });
-        self.convergence.held_out = views;
-        scores
-    }
-
-    /// [`TargetViews::mean_psnr_and_detail`] of the held-out views.
-    pub(super) fn held_out_psnr_and_detail(&mut self) -> Result<Option<[f64; 2]>> {
-        let (affines, degree) = (self.affines()?, self.sh_degree(self.step));
-        let views = std::mem::take(&mut self.convergence.held_out);
-        let render = |camera: &Camera| self.render_of_degree(camera, degree);
-        let scores = views.mean_psnr_and_detail(&affines, render);
-        self.convergence.held_out = views;
-        scores
-    }
-
-    /// Resets the denoiser to the identity if it hardly improves the held-out views (or, without any, some training
-    /// views) over R_0. Called at the end of a run; the paper's denoiser is kept.
-    pub(crate) fn drop_unused_degree(&mut self) -> Result<()> {
-        /// In dB; on few views, smaller gains are chance.
-        const MIN_GAIN: f64 = 0.05;
-        if !self.supervision.networks.as_ref().is_some_and(NetworkTerms::follow_target) {
-            return Ok(());
-        }
-        let sh_degree = self.sh_degree(self.step);
-        let scores = match self.psnr_of_held_out(sh_degree)? {
-            None => {
-                let views = self.some_training_views()?;
-                views.mean_psnr(&self.affines()?, |camera| {
-                    self.render_of_degree(camera, sh_degree)
-                })?
-            }
-            scores => scores,
-        };
-        let Some([colors, denoised]) = scores else { return Ok(()) };
-        let gain = denoised - colors;
-        if gain >= MIN_GAIN {
-            tracing::info!("the denoiser gains {gain:.2} dB on targets");
-            return Ok(());
-        }
-        tracing::info!("the denoiser gains nothing on targets ({gain:.2} dB) and is dropped");
-        match self.supervision.networks.as_mut().and_then(|terms| terms.networks.denoiser.as_mut())
-        {
-            Some(denoiser) => denoiser.become_identity(),
-            None => Ok(()),
-        }
-    }
-
-    /// Training views, evenly spread, with their targets.
-    fn some_training_views(&self) -> Result<TargetViews> {
-        const MOST: usize = 8;
-        let views = self.supervision.views.whole();
-        let some = views.iter().step_by(views.len().div_ceil(MOST).max(1)).map(|view| {
-            let views = std::slice::from_ref(view);
-            let target = self.supervision.views.read(
-                &self.supervision.targets.pseudo_gt,
-                views,
-                ImageKind::Targets,
-            )?;
-            let UVec2 { x: width, y: height } = view.size();
-            let target = Image { width, height, data: target.concat() };
-            let (camera, photograph) = (view.patch.own_camera(), Some(view.photograph));
-            Ok(TargetView { camera, target, mask: None, photograph })
-        });
-        Ok(TargetViews(some.collect::<Result<_>>()?))
-    }
-
-    /// The exposure of every training photograph, if exposures are learned.
-    pub(super) fn affines(&self) -> Result<Vec<Affine>> {
-        self.supervision.exposures.as_ref().map_or_else(|| Ok(vec![]), Exposures::affines)
-    }
 }

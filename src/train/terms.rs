@@ -3,9 +3,11 @@
 use glam::UVec2;
 use nightsplat_core::random::Stream;
 
+use super::config::TrainConfig;
 use super::masks::Masking;
 use super::networks::Networks;
-use super::{ModelConfig, TrainConfig, streams};
+use super::parts::ModelConfig;
+use super::streams;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ssim_window::RADIUS;
 use crate::loss::{

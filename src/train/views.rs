@@ -10,8 +10,8 @@ use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::scene_tone::photographs;
 
-use super::TrainConfig;
 use super::cache::{Cache, CacheSize, CacheSlot};
+use super::config::TrainConfig;
 use super::epochs::Epochs;
 use super::precision::Encoder;
 use crate::Result;
@@ -155,8 +155,7 @@ impl Views {
         let (mut taken, mut wanted) = (BTreeSet::new(), vec![]);
         let (mut bytes, mut last) = (0, *steps.start());
         for step in steps {
-            let level = config.schedule.resolution_level(step);
-            let view = self.get(self.of_step(config.seed, step, level));
+            let view = self.get(self.at_step(config, step));
             let slots = [Some(view.stored), view.dark].into_iter().flatten();
             let bytes_of_view: u64 = slots.clone().map(|slot| self.cache.bytes(slot)).sum();
             let is_new = !taken.contains(&view.id);
@@ -284,11 +283,11 @@ impl Views {
         Ok(whites)
     }
 
-    /// The view of a step at a level: every epoch takes each view once, in its own order; the view after one that is
-    /// left out is taken twice.
-    pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> TrainingView {
-        let range = self.levels[level].clone();
-        let (order, first) = self.epochs.of_step(seed, step, range.len());
+    /// The view of a step: every epoch takes each view once, in its own order; the view after one that is left out is
+    /// taken twice.
+    pub(super) fn at_step(&self, config: &TrainConfig, step: u64) -> TrainingView {
+        let range = self.levels[config.schedule.resolution_level(step)].clone();
+        let (order, first) = self.epochs.of_step(config.seed, step, range.len());
         let views = &self.all[range];
         let in_turn = order[first..].iter().chain(&order[..first]);
         let mut kept = in_turn.filter(|at| !self.left_out.contains(&views[**at].photograph));

@@ -11,8 +11,8 @@ use toml::Value;
 
 use super::{Diagnosis, SceneDiagnosis};
 use crate::splats::scene::{Features, Shape, width};
+use crate::train::config::{LampConfig, TrainConfig};
 use crate::train::layers::{Origin, SettingsLayer};
-use crate::train::{LampConfig, TrainConfig};
 use crate::{Error, Result};
 
 /// Below this brightening, targets are the photographs themselves, as in `--curve auto`.

@@ -4,7 +4,7 @@ use nightsplat_photographs::dataset::{Dataset, LoadOptions, MeasuredSize, View};
 
 use super::geometry::SceneGeometry;
 use super::lamp::{LampObservations, bands, falloff::FalloffDiagnosis};
-use crate::train::TrainConfig;
+use crate::train::config::TrainConfig;
 
 /// Remarks on rows and corners of a dataset's training photographs, at shared points; none if it cannot be loaded.
 pub(crate) fn remarks_at_points(config: &TrainConfig) -> Vec<String> {

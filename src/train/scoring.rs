@@ -1,0 +1,176 @@
+//! The held-out views in a run: their scores, and what is decided by them.
+
+use nightsplat_core::camera::Camera;
+
+use super::decisions::{HeldOutScore, PATIENCE, RecordedRound};
+use super::early_stopping::{EndReason, Ended};
+use super::rendered::Rendered;
+use super::supervision::Supervision;
+use super::target_views::TargetViews;
+use super::terms::NetworkTerms;
+use super::trainer::Trainer;
+use crate::Result;
+
+impl Trainer {
+    /// The mean PSNR, dB, of the Gaussians' colours on the held-out views against their targets; `None` without
+    /// held-out views.
+    #[doc(hidden)]
+    pub fn held_out_psnr(&mut self) -> Result<Option<f64>> {
+        self.held_out_psnr_of_degree(self.clock.sh_degree(self.clock.step))
+    }
+
+    /// [`Trainer::held_out_psnr`] with a given SH degree.
+    fn held_out_psnr_of_degree(&mut self, sh_degree: u32) -> Result<Option<f64>> {
+        Ok(self.psnr_of_held_out(sh_degree)?.map(|[colors, _]| colors))
+    }
+
+    /// The mean PSNR, dB, of R_0 and of the output (R_K if the model has a denoiser); `None` if no view is held out.
+    fn psnr_of_held_out(&mut self, sh_degree: u32) -> Result<Option<[f64; 2]>> {
+        let affines = self.supervision.affines()?;
+        self.with_held_out(sh_degree, |views, render| views.mean_psnr(&affines, render))
+    }
+
+    /// What `score` makes of the held-out views and their renders.
+    fn with_held_out<T>(
+        &mut self,
+        sh_degree: u32,
+        score: impl FnOnce(&TargetViews, &mut dyn FnMut(&Camera) -> Result<Rendered>) -> Result<T>,
+    ) -> Result<T> {
+        let Self { supervision: Supervision { held_out, networks, .. }, model, .. } = self;
+        let mut networks = networks.as_mut().map(|terms| &mut terms.networks);
+        score(held_out, &mut |camera| model.render(camera, sh_degree, networks.as_deref_mut()))
+    }
+
+    /// Scores the held-out views, keeps the model if it is the best so far, and decides whether the run has converged.
+    pub(super) fn score_held_out(&mut self) -> Result<()> {
+        let _phase = tracing::info_span!("scoring").entered();
+        let (step, affines) = (self.clock.step, self.supervision.affines()?);
+        let scores = self.with_held_out(self.clock.sh_degree(step), |views, render| {
+            views.mean_psnr_and_detail(&affines, render)
+        })?;
+        let Some([psnr, detail]) = scores else { return Ok(()) };
+        let [score, detail] = [1e3 * psnr, 1e6 * detail].map(|score| score.round() as i64);
+        let score = HeldOutScore { step, score, detail };
+        tracing::debug!(
+            "step {step}: held-out views {psnr:.3} dB, detail {:.5}",
+            detail as f64 / 1e6
+        );
+        let is_best = self.clock.best_score().is_none_or(|best| score.score > best.score);
+        let [_, whole] = self.config.schedule.resolution_steps;
+        if is_best && step >= whole {
+            self.model.best = self.snapshot()?;
+        }
+        self.clock.decisions.scores.push(score);
+        let in_units = |score: HeldOutScore| [score.score as f64 / 1e3, score.detail as f64 / 1e6];
+        let scores: Vec<[f64; 2]> = self.clock.whole_scores().map(in_units).collect();
+        if self.clock.may_end_early() && self.config.stop.has_converged(&scores) {
+            self.clock.decisions.converged = Some(step);
+            tracing::info!(
+                "step {step}: the held-out views have converged; the run ends at step {}",
+                self.last_step()
+            );
+        }
+        Ok(())
+    }
+
+    /// The limit of Gaussians from the held-out views, decided before every round of density control.
+    pub(super) fn growth_limit(&mut self) -> Result<usize> {
+        let (growth_gain, step) = (self.config.stop.growth_gain, self.clock.step);
+        let [_, whole] = self.config.schedule.resolution_steps;
+        let gaussians = self.model.count();
+        // A score taken before memory ran out is not taken again.
+        let is_scored = self.clock.decisions.rounds.last().is_some_and(|round| round.step == step);
+        if growth_gain > 0.0 && self.clock.decisions.gaussians.is_none() && step >= whole {
+            let psnr = if is_scored { None } else { self.held_out_psnr()? };
+            if let Some(psnr) = psnr {
+                let score = (1e3 * psnr).round() as i64;
+                self.clock.decisions.rounds.push(RecordedRound { step, score, gaussians });
+            }
+            if self.clock.decisions.gains_too_little(growth_gain) {
+                self.clock.decisions.gaussians = Some(gaussians);
+                tracing::info!(
+                    "step {step}: growth ends at {gaussians} Gaussians: {PATIENCE} rounds gained less on the held-out \
+                     views than {growth_gain} dB for each doubling"
+                );
+            }
+        }
+        Ok(self.clock.decisions.gaussians.unwrap_or(usize::MAX))
+    }
+
+    /// Compares the held-out views with and without the SH degree in use; a degree that gains too little is removed for
+    /// good.
+    pub(super) fn decide_degree(&mut self) -> Result<()> {
+        let step = self.clock.step;
+        let (degree, least) = (self.clock.sh_degree(step), self.config.stop.degree_gain);
+        let with = self.held_out_psnr_of_degree(degree)?;
+        let without = self.held_out_psnr_of_degree(degree - 1)?;
+        let Some((with, without)) = with.zip(without) else { return Ok(()) };
+        let gain = with - without;
+        if gain >= least {
+            tracing::info!("step {step}: SH degree {degree} gains {gain:.2} dB");
+            return Ok(());
+        }
+        tracing::info!(
+            "step {step}: SH degree {degree} gains {gain:.2} dB on the held-out views, less than {least}: it stays at \
+             {}",
+            degree - 1
+        );
+        self.model.set_sh_degree(&self.gpu, degree - 1)?;
+        self.clock.decisions.sh_degree = Some(degree - 1);
+        Ok(())
+    }
+
+    /// Ends the run with its best model: if the last score is lower than the best by more than
+    /// [`StopConfig::margin`](super::StopConfig::margin), the model of the best is restored. No steps may follow; to
+    /// continue later, save a checkpoint first.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn end(&mut self) -> Result<Ended> {
+        if std::mem::take(&mut self.clock.decisions.score_due) {
+            self.score_held_out()?;
+        }
+        let step = self.clock.step;
+        let reason = self.clock.converged().map_or(EndReason::Steps, |_| EndReason::Converged);
+        let last = self.clock.decisions.scores.last().filter(|last| last.step == step);
+        let lost =
+            |best: &HeldOutScore| last.map_or(0.0, |last| (best.score - last.score) as f64 / 1e3);
+        let better = self.clock.best_score().filter(|best| lost(best) > self.config.stop.margin);
+        let best = std::mem::take(&mut self.model.best);
+        if better.is_some() {
+            self.restore_snapshot(&best)?;
+        }
+        Ok(Ended { reason, step, best_step: better.map_or(step, |better| better.step) })
+    }
+
+    /// Resets the denoiser to the identity if it hardly improves the held-out views (or, without any, some training
+    /// views) over R_0. Called at the end of a run; the paper's denoiser is kept.
+    pub(crate) fn drop_unused_degree(&mut self) -> Result<()> {
+        /// In dB; on few views, smaller gains are chance.
+        const MIN_GAIN: f64 = 0.05;
+        if !self.supervision.networks.as_ref().is_some_and(NetworkTerms::follow_target) {
+            return Ok(());
+        }
+        let Supervision { views, targets, held_out, .. } = &mut self.supervision;
+        let without = held_out.is_empty();
+        if without {
+            *held_out = TargetViews::of_training(views, &targets.pseudo_gt)?;
+        }
+        let scores = self.psnr_of_held_out(self.clock.sh_degree(self.clock.step));
+        if without {
+            self.supervision.held_out = TargetViews::default();
+        }
+        let Some([colors, denoised]) = scores? else { return Ok(()) };
+        let gain = denoised - colors;
+        if gain >= MIN_GAIN {
+            tracing::info!("the denoiser gains {gain:.2} dB on targets");
+            return Ok(());
+        }
+        tracing::info!("the denoiser gains nothing on targets ({gain:.2} dB) and is dropped");
+        let networks = self.supervision.networks.as_mut();
+        match networks.and_then(|terms| terms.networks.denoiser.as_mut()) {
+            Some(denoiser) => denoiser.become_identity(),
+            None => Ok(()),
+        }
+    }
+}
