@@ -5,6 +5,7 @@
 //! - [`eval`]: scores of the test views
 //! - [`run`]: a training run, its events and its directory
 //! - [`run_facts`]: the summary of a run before its first step
+//! - [`sweep`]: the results of a sweep
 //! - [`report`]: tables and plots in one self-contained page
 //! - [`colour_map`]: numbers as colours
 //! - [`comparison`]: runs on one dataset, view by view
@@ -33,5 +34,6 @@ pub mod report;
 pub mod run;
 pub mod run_export;
 pub mod run_facts;
+pub mod sweep;
 pub mod video;
 pub mod view_exposures;

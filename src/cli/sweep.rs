@@ -11,17 +11,12 @@
 //!
 //! Only the costs depend on the speed of the device and on interruptions.
 
-mod costs;
 mod grid;
-mod leaderboard;
 mod options;
-mod point;
-mod rows;
 mod run;
 mod runner;
 mod scenes;
 mod scores;
-mod table;
 
 use std::path::{Path, PathBuf};
 
@@ -35,18 +30,18 @@ use nightsplat_photographs::tree::check_writable;
 use serde::Serialize;
 
 use self::grid::Grid;
-use self::leaderboard::Leaderboard;
 use self::options::Options;
-use self::point::{ADAPTIVE, OFFSET, PARTS, SweepAxis};
-use self::rows::SweepResults;
 pub(super) use self::run::parsed;
-use self::run::{Run, absolute, difference};
-use self::runner::FailedPoint;
+use self::run::{SweepTraining, absolute, difference};
 use super::eval::LpipsRange;
 use super::{finish, print, progress_bar, tell};
 use crate::Error;
 use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
+use crate::results::sweep::{
+    ADAPTIVE, COST_FILES, FailedPoint, LEADERBOARD_FILES, Leaderboard, OFFSET, PARTS, SweepAxis,
+    SweepResults, SweepRun,
+};
 use crate::train::{Part, TrainConfig, diagnosed};
 
 /// Train over a grid of settings, and rank the results.
@@ -142,26 +137,27 @@ fn swept(
     links: &[[String; 2]],
 ) -> Result<Option<(SweepResults, Vec<FailedPoint>)>> {
     check_writable(&args.out)?;
-    let (runs, dataset) = plan(args)?;
+    let (trainings, dataset) = plan(args)?;
     let mut left = vec![];
-    for run in &runs {
-        if !run.is_finished()? {
-            left.push(run);
+    for training in &trainings {
+        if !training.is_finished()? {
+            left.push(training);
         }
     }
-    let first = &runs[0].config;
+    let first = &trainings[0].config;
     if !args.dry_run && !left.is_empty() {
         open(first)?;
     }
-    claim(args, &runs)?;
+    claim(args, &trainings)?;
     if args.dry_run {
-        for run in left {
-            print(run.command_line()?)?;
+        for training in left {
+            print(training.command_line()?)?;
         }
         return Ok(None);
     }
     let bar = progress_bar(left.len());
-    let failures = runner::train(&left, args.jobs.into(), &bar, &args.out, runs.len())?;
+    let failures = runner::train(&left, args.jobs.into(), &bar, &args.out, trainings.len())?;
+    let runs: Vec<SweepRun> = trainings.iter().map(|training| training.run.clone()).collect();
 
     if let Some(weights) = &args.lpips {
         let finished = runs.iter().filter(|run| run.metrics().is_some());
@@ -169,13 +165,13 @@ fn swept(
         scores::add_lpips(&folders, &open(first)?, weights, args.lpips_range.into())?;
     }
     let rows = SweepResults::new(&runs, args.table.and_then(Grid::baseline));
-    let settings = settings(&runs, &rows.seeds, &args.options.shared);
+    let settings = settings(&trainings, &rows.seeds, &args.options.shared);
     let leaderboard = Leaderboard {
         rows: &rows,
         title: title.to_owned(),
         intro: intro.iter().cloned().chain([settings]).collect(),
         links: links.to_vec(),
-        adaptive_offset: adaptive_offset(&runs, &dataset),
+        adaptive_offset: adaptive_offset(&trainings, &dataset),
         failures: &failures,
     };
     // Images need the device; scores do not.
@@ -204,7 +200,7 @@ fn open(config: &TrainConfig) -> crate::Result<Gpu> {
 }
 
 /// The points of the grid, each checked as in `train`, and their dataset.
-fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
+fn plan(args: &SweepArgs) -> crate::Result<(Vec<SweepTraining>, Dataset)> {
     let lists = [("alpha", &args.alpha), ("beta", &args.beta), (OFFSET, &args.offset)];
     let mut axes = vec![];
     for (key, list) in lists {
@@ -225,22 +221,23 @@ fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
     }
     let points = grid::points(&axes, args.table)?;
     let (dataset, out) = (absolute(&args.dataset)?, PathBuf::from(absolute(&args.out)?));
-    let mut runs: Vec<Run> = vec![];
+    let mut trainings: Vec<SweepTraining> = vec![];
     for point in points {
-        let run = Run::new(point, &dataset, shared, &out)?;
-        match runs.iter().find(|other| other.config == run.config) {
-            None => runs.push(run),
+        let training = SweepTraining::new(point, &dataset, shared, &out)?;
+        let is_same = |other: &&SweepTraining| other.config == training.config;
+        match trainings.iter().find(is_same).map(|other| &other.run.name) {
+            None => trainings.push(training),
             Some(other) if args.table.is_some() => {
-                tracing::info!("{} is skipped: it is the same run as {}", run.name, other.name);
+                tracing::info!("{} is skipped: it is the same run as {other}", training.run.name);
             }
-            Some(other) => {
-                let (one, other) = (&other.name, &run.name);
+            Some(one) => {
+                let other = &training.run.name;
                 let problem = format!("{one} and {other} are the same run; leave one out");
                 return Err(Error::Usage(problem));
             }
         }
     }
-    let first = &runs[0].config;
+    let first = &trainings[0].config;
     let dataset = Dataset::load(&first.dataset, &diagnosed(first))?;
     if !dataset.test_views().any(|view| view.has_reference() || view.has_photograph()) {
         let problem = "has no held-out view to score; pass --test-every N, or list one in transforms_test.json or \
@@ -248,14 +245,14 @@ fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
         return Err(Error::input(&dataset.root, problem));
     }
     if !dataset.train_views().any(|view| view.depth.is_some()) {
-        runs.retain(|run| run.point.value(PARTS) != Some(Part::Depth.name()));
+        trainings.retain(|it| it.run.point.value(PARTS) != Some(Part::Depth.name()));
     }
-    Ok((runs, dataset))
+    Ok((trainings, dataset))
 }
 
 /// Claims a folder that is empty, has this sweep, or has no file that a sweep would replace.
-fn claim(args: &SweepArgs, runs: &[Run]) -> crate::Result<()> {
-    let (folder, manifest) = (&args.out, manifest(args, runs)?);
+fn claim(args: &SweepArgs, trainings: &[SweepTraining]) -> crate::Result<()> {
+    let (folder, manifest) = (&args.out, manifest(args, trainings)?);
     let path = folder.join("sweep.toml");
     if path.exists() {
         let found = input::text(&path)?;
@@ -266,7 +263,7 @@ fn claim(args: &SweepArgs, runs: &[Run]) -> crate::Result<()> {
         }
         return Ok(());
     }
-    let files = leaderboard::FILES.iter().chain(&costs::FILES);
+    let files = LEADERBOARD_FILES.iter().chain(&COST_FILES);
     if let Some(file) = files.into_iter().find(|file| folder.join(file).exists()) {
         let problem = format!("contains {file}, which no sweep wrote; choose another --out");
         return Err(Error::output(folder, problem));
@@ -279,14 +276,17 @@ fn claim(args: &SweepArgs, runs: &[Run]) -> crate::Result<()> {
 }
 
 /// The contents of `sweep.toml`: the sweep without the values of its lists.
-fn manifest(args: &SweepArgs, runs: &[Run]) -> crate::Result<String> {
+fn manifest(args: &SweepArgs, trainings: &[SweepTraining]) -> crate::Result<String> {
     #[derive(Serialize)]
     struct SweepManifest<'a> {
         dataset: String,
         train: &'a [String],
         lists: Vec<&'a str>,
     }
-    let keys = runs.iter().flat_map(|run| &run.point.values).map(|(key, _)| key.as_str());
+    let keys = trainings
+        .iter()
+        .flat_map(|training| &training.run.point.values)
+        .map(|(key, _)| key.as_str());
     let mut lists: Vec<&str> = keys.collect();
     lists.sort_unstable();
     lists.dedup();
@@ -296,12 +296,12 @@ fn manifest(args: &SweepArgs, runs: &[Run]) -> crate::Result<String> {
 }
 
 /// A sentence on the number of runs and their common options.
-fn settings(runs: &[Run], seeds: &[String], shared: &[String]) -> String {
-    let mut steps: Vec<u64> = runs.iter().map(|run| run.config.steps).collect();
+fn settings(trainings: &[SweepTraining], seeds: &[String], shared: &[String]) -> String {
+    let mut steps: Vec<u64> = trainings.iter().map(|training| training.config.steps).collect();
     steps.sort_unstable();
     steps.dedup();
     let steps: Vec<String> = steps.iter().map(u64::to_string).collect();
-    let mut text = format!("{} runs of {} steps", runs.len(), steps.join(" or "));
+    let mut text = format!("{} runs of {} steps", trainings.len(), steps.join(" or "));
     if seeds.len() > 1 {
         let seeds = seeds.join(", ");
         text += &format!("; scores are means over the seeds {seeds}, and bars their range");
@@ -313,11 +313,12 @@ fn settings(runs: &[Run], seeds: &[String], shared: &[String]) -> String {
 }
 
 /// Mean delta0 over the training views, if the sweep has the adaptive black level.
-fn adaptive_offset(runs: &[Run], dataset: &Dataset) -> Option<f64> {
-    let run = runs.iter().find(|run| run.point.value(OFFSET) == Some(ADAPTIVE))?;
+fn adaptive_offset(trainings: &[SweepTraining], dataset: &Dataset) -> Option<f64> {
+    let is_adaptive = |it: &&SweepTraining| it.run.point.value(OFFSET) == Some(ADAPTIVE);
+    let config = &trainings.iter().find(is_adaptive)?.config;
     // Unreadable photographs are reported by the training.
     let images = dataset.train_views().filter_map(|view| view.loaded().ok().flatten());
     let offsets: Vec<f64> =
-        images.map(|image| run.config.tone.offset(Statistics::new(&image.data).ratio())).collect();
+        images.map(|image| config.tone.offset(Statistics::new(&image.data).ratio())).collect();
     Some(offsets.iter().sum::<f64>() / offsets.len() as f64)
 }

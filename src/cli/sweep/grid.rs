@@ -1,6 +1,6 @@
 //! The points of a sweep: all combinations of the values of its axes, and named grids.
 
-use super::point::{
+use crate::results::sweep::{
     ADAPTIVE, ALL_PARTS, OFFSET, PARTS, PLAIN, PRESET, SweepAxis, SweepPoint, all_curves,
 };
 use crate::train::{Part, Preset};

@@ -9,6 +9,7 @@ use clap::{Arg, ArgMatches, Args, Command, Error, FromArgMatches, ValueHint};
 
 use super::GRID;
 use crate::cli::train::TrainOptions;
+use crate::results::sweep::pair;
 
 /// Options of `train` that take a list here: name in `train`, name here, help.
 const LISTS: [(&str, &str, &str); 5] = [
@@ -86,15 +87,6 @@ impl Options {
         let value = if is_path { absolute(Path::new(&value))? } else { value };
         self.shared.extend(pair(long, &value));
         Ok(())
-    }
-}
-
-/// An option and its value as arguments, joined if the value looks like an option.
-pub(super) fn pair(long: &str, value: &str) -> Vec<String> {
-    if value.starts_with('-') {
-        vec![format!("--{long}={value}")]
-    } else {
-        vec![format!("--{long}"), value.to_owned()]
     }
 }
 

@@ -1,30 +1,22 @@
 //! A run of a sweep: a `nightsplat train` process with its run directory.
 
 use std::ffi::OsString;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use clap::Args;
-use nightsplat_photographs::dataset::View;
-use nightsplat_photographs::image::Image;
 
-use super::point::{PRESET, SweepPoint};
-use super::scores;
 use crate::cli::quoted;
 use crate::cli::train::TrainArgs;
-use crate::gpu::Gpu;
-use crate::results::eval::ModelRenderer;
 use crate::results::run;
-use crate::splats::model::Model;
+use crate::results::sweep::{PRESET, SweepPoint, SweepRun};
 use crate::train::TrainConfig;
 use crate::train::diagnose::Plan;
 use crate::{Error, Result};
 
-/// A point with the arguments of its training.
+/// A run with the arguments of its training.
 #[derive(Clone, Debug)]
-pub(super) struct Run {
-    pub(super) name: String,
-    pub(super) point: SweepPoint,
-    pub(super) folder: PathBuf,
+pub(super) struct SweepTraining {
+    pub(super) run: SweepRun,
     /// Arguments of `nightsplat`.
     pub(super) arguments: Vec<String>,
     /// Configuration by these arguments, without a plan.
@@ -32,7 +24,7 @@ pub(super) struct Run {
     args: TrainArgs,
 }
 
-impl Run {
+impl SweepTraining {
     /// The run of a point with the options `shared`, in a folder of `out`; both paths are absolute. Points with a
     /// preset train with its plan for the photographs, as `train --preset` does; others train without a plan, so that
     /// they differ in nothing but their settings.
@@ -55,17 +47,17 @@ impl Run {
         }
         arguments.extend(end);
         let config = args.options.config(&args.dataset, None)?;
-        Ok(Self { name, point, folder, arguments, config, args })
+        Ok(Self { run: SweepRun { name, point, folder }, arguments, config, args })
     }
 
     /// Whether the run directory contains this run, finished.
     pub(super) fn is_finished(&self) -> Result<bool> {
-        let path = self.folder.join("config.toml");
+        let path = self.run.folder.join("config.toml");
         if !path.exists() {
             return Ok(false);
         }
-        let found = run::load_config(&self.folder)?;
-        let plan = if self.args.plan.is_none() { run::plan_of(&self.folder) } else { None };
+        let found = run::load_config(&self.run.folder)?;
+        let plan = if self.args.plan.is_none() { run::plan_of(&self.run.folder) } else { None };
         let plan = plan.map(|path| Plan::read(&path)).transpose()?;
         let config = self.args.options.config(&self.args.dataset, plan.as_ref())?;
         let config = config.with_absolute_paths();
@@ -75,27 +67,9 @@ impl Run {
         if found != config {
             let differs = difference(&found.to_toml()?, &config.to_toml()?);
             let problem = format!("contains another run ({differs}); choose another --out");
-            return Err(Error::output(&self.folder, problem));
+            return Err(Error::output(&self.run.folder, problem));
         }
-        Ok(self.metrics().is_some())
-    }
-
-    /// `metrics.json`, with the scores that were measured later, if the run is finished.
-    pub(super) fn metrics(&self) -> Option<serde_json::Value> {
-        let text = std::fs::read(self.folder.join("metrics.json")).ok()?;
-        let metrics = serde_json::from_slice(&text).ok()?;
-        Some(scores::added(&self.folder, metrics))
-    }
-
-    /// Renders a view with the model of the finished run.
-    pub(super) fn render(&self, gpu: &Gpu, view: &View) -> Result<Image> {
-        let config = run::load_config(&self.folder)?;
-        let model = Model::load(&self.folder)?;
-        let networks =
-            run::load_networks(gpu, &self.folder, &config.model, model.gaussians.shape.features)?;
-        let mut model_renderer = ModelRenderer::new(gpu, &model, &config, networks)?;
-        model_renderer.set_lamp(run::load_lamp(&self.folder)?)?;
-        Ok(model_renderer.render(view)?.output().clone())
+        Ok(self.run.metrics().is_some())
     }
 
     /// The command for a shell; repeating it is safe.

@@ -15,26 +15,18 @@ use std::time::{Duration, Instant};
 use indicatif::ProgressBar;
 use nightsplat_core::output::own_file;
 
-use super::run::Run;
+use super::run::SweepTraining;
 use crate::cli::{child, signals, tell_on_stderr};
 use crate::results::run::Requests;
+use crate::results::sweep::FailedPoint;
 use crate::{Error, Result, Stop};
-
-/// A point that failed.
-#[derive(Clone, Debug)]
-pub(super) struct FailedPoint {
-    /// The point's name.
-    pub(super) name: String,
-    /// Last error of its process.
-    pub(super) reason: String,
-}
 
 /// Trains `runs`, `jobs` at once, and returns the failures in their order.
 ///
 /// # Errors
 /// [`Error::BatchStopped`] after a signal, or if the time of a run is up; `all` counts the runs of `folder`.
 pub(super) fn train(
-    runs: &[&Run],
+    runs: &[&SweepTraining],
     jobs: usize,
     bar: &ProgressBar,
     folder: &Path,
@@ -46,25 +38,25 @@ pub(super) fn train(
     let begin = Instant::now();
     let (next, busy, failures) = (AtomicUsize::new(0), Mutex::new(vec![]), Mutex::new(vec![]));
     let finish = |index: usize, waits: bool| {
-        let run: &Run = runs[index];
+        let run: &SweepTraining = runs[index];
         let failure = match attempt(run, waits, &requests) {
             Ok(RunState::Finished) => None,
             Ok(RunState::Busy) => return locked(&busy).push(index),
             Ok(RunState::Saved) => return time_up.store(true, Ordering::Relaxed),
             Err(error) => Some(error.to_string()),
         };
-        bar.set_message(run.name.clone());
+        bar.set_message(run.run.name.clone());
         bar.inc(1);
         if bar.is_hidden() {
             let (done, of) = (bar.position(), runs.len());
             let state = if failure.is_none() { "finished" } else { "failed" };
             let seconds = begin.elapsed().as_secs_f64();
-            let line = format!("{done} of {of}: {} {state}, {seconds:.0} s", run.name);
+            let line = format!("{done} of {of}: {} {state}, {seconds:.0} s", run.run.name);
             tell_on_stderr(line);
         }
         if let Some(reason) = failure {
-            bar.suspend(|| tracing::warn!("{} failed: {reason}", run.name));
-            locked(&failures).push((index, FailedPoint { name: run.name.clone(), reason }));
+            bar.suspend(|| tracing::warn!("{} failed: {reason}", run.run.name));
+            locked(&failures).push((index, FailedPoint { name: run.run.name.clone(), reason }));
         }
     };
     std::thread::scope(|scope| {
@@ -112,11 +104,11 @@ enum RunState {
 }
 
 /// Trains a run unless it is finished, or another process trains it and `waits` is false.
-fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<RunState> {
+fn attempt(run: &SweepTraining, waits: bool, requests: &Requests) -> Result<RunState> {
     let unusable =
-        |error: std::io::Error| Error::output(&run.folder, format!("cannot be used: {error}"));
-    std::fs::create_dir_all(&run.folder).map_err(unusable)?;
-    let lock = File::create(own_file(run.folder.join("lock"))?).map_err(unusable)?;
+        |error: std::io::Error| Error::output(&run.run.folder, format!("cannot be used: {error}"));
+    std::fs::create_dir_all(&run.run.folder).map_err(unusable)?;
+    let lock = File::create(own_file(run.run.folder.join("lock"))?).map_err(unusable)?;
     match lock.try_lock() {
         Err(TryLockError::WouldBlock) if waits => lock.lock().map_err(unusable)?,
         Err(TryLockError::WouldBlock) => return Ok(RunState::Busy),
@@ -126,7 +118,7 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<RunState> {
     if run.is_finished()? {
         return Ok(RunState::Finished);
     }
-    let log = own_file(run.folder.join("log.txt"))?;
+    let log = own_file(run.run.folder.join("log.txt"))?;
     let mut output = File::create(&log).map_err(unusable)?;
     writeln!(output, "{}", run.command_line()?).map_err(unusable)?;
     let mut process = child::command()
@@ -146,7 +138,7 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<RunState> {
     }
     let printed = std::fs::read(&log).unwrap_or_default();
     let reason = last_words(&String::from_utf8_lossy(&printed), status);
-    Err(Error::output(&run.folder, format!("{reason}; see log.txt")))
+    Err(Error::output(&run.run.folder, format!("{reason}; see log.txt")))
 }
 
 /// The last error in a log, or else the exit status.

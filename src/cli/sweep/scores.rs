@@ -4,23 +4,20 @@ use std::path::Path;
 
 use nightsplat_core::output::{own_file, write_whole};
 use nightsplat_photographs::dataset::View;
-use serde_json::{Value, json};
 
 use crate::cli::opener;
 use crate::gpu::Gpu;
 use crate::networks::lpips::{Lpips, Range};
 use crate::results::eval::{Evaluation, Extras, ScoreReference};
 use crate::results::finished_run::FinishedRun;
+use crate::results::sweep::{LPIPS_FILE, measured_later};
 use crate::{Error, Result};
-
-/// The file of a run: values by the key of their measure, as in `metrics.json`.
-pub(super) const FILE: &str = "lpips.json";
 
 /// Measures the finished runs in these folders that have no value of this network and range yet.
 pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range) -> Result<()> {
     let key = Lpips::load(gpu, weights, range)?.measure().key();
     for run in runs {
-        let mut metrics = load(run);
+        let mut metrics = measured_later(run);
         if metrics["mean"].get(&key).is_some() {
             continue;
         }
@@ -34,24 +31,8 @@ pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range)
         let evaluation = Evaluation::new(&mut reference, &dataset, &extras, render, |_| Ok(()))?;
         evaluation.add_lpips(&mut metrics);
         let text = serde_json::to_string_pretty(&metrics)
-            .map_err(|error| Error::output(run.join(FILE), error.to_string()))?;
-        write_whole(&own_file(run.join(FILE))?, text.as_bytes())?;
+            .map_err(|error| Error::output(run.join(LPIPS_FILE), error.to_string()))?;
+        write_whole(&own_file(run.join(LPIPS_FILE))?, text.as_bytes())?;
     }
     Ok(())
-}
-
-/// What was measured of a run.
-fn load(folder: &Path) -> Value {
-    let text = std::fs::read(folder.join(FILE)).ok();
-    let metrics = text.and_then(|text| serde_json::from_slice(&text).ok());
-    metrics.unwrap_or_else(|| json!({ "mean": {}, "views": {} }))
-}
-
-/// Adds what was measured to the metrics of a run.
-pub(super) fn added(folder: &Path, mut metrics: Value) -> Value {
-    let scored = load(folder);
-    for (key, value) in scored["mean"].as_object().into_iter().flatten() {
-        metrics["mean"][key] = value.clone();
-    }
-    metrics
 }

@@ -6,14 +6,14 @@ use nightsplat_core::output::write_whole;
 use serde_json::{Map, Value, json};
 
 use super::rows::{SweepResults, SweepRow};
-use super::runner::FailedPoint;
+use super::run::FailedPoint;
 use super::table::{ColumnStatistic, KEYS, Quantity};
 use crate::Result;
 use crate::results::report::{Chart, Mark, NumberTable, Report, Series};
 use crate::results::run::{Progress, energy_counters};
 
 /// The files of the costs.
-pub(super) const FILES: [&str; 2] = ["costs.csv", "costs.html"];
+pub const FILES: [&str; 2] = ["costs.csv", "costs.html"];
 
 /// Range of intermediate scores that is plotted, dB.
 const SHOWN_DECIBELS: f64 = 3.0;
@@ -57,7 +57,7 @@ fn front(points: &[(f64, f64)]) -> Vec<usize> {
 
 impl SweepResults {
     /// Writes [`FILES`] to `folder`; `notes` are paragraphs of the page.
-    pub(super) fn save_costs(&self, folder: &Path, title: &str, notes: &[String]) -> Result<()> {
+    pub fn save_costs(&self, folder: &Path, title: &str, notes: &[String]) -> Result<()> {
         let counters = energy_counters();
         let energy = if counters.is_empty() {
             "No energy counter is readable on this machine.".to_owned()
@@ -101,7 +101,7 @@ impl SweepResults {
     }
 
     /// All rows with all quantities.
-    pub(super) fn costs(&self) -> NumberTable {
+    pub fn costs(&self) -> NumberTable {
         let mut table = self.table("All points", &self.quantities(ColumnStatistic::Mean));
         for (number, (label, _)) in (1..).zip(&mut table.rows) {
             *label = format!("{number}  {label}");
@@ -183,7 +183,7 @@ impl SweepResults {
     }
 
     /// All quantities as JSON, with the differences to the baseline.
-    pub(super) fn json(&self, dataset: &Path, failures: &[FailedPoint]) -> Value {
+    pub fn json(&self, dataset: &Path, failures: &[FailedPoint]) -> Value {
         let keys = KEYS.into_iter().chain(self.scores.iter().map(String::as_str));
         let quantities: Vec<Quantity> = keys.map(Quantity::new).collect();
         let of = |value: &dyn Fn(&str) -> Option<f64>| {
@@ -223,7 +223,7 @@ impl SweepResults {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::sweep::point::SweepPoint;
+    use crate::results::sweep::SweepPoint;
 
     const MIB: f64 = 1_048_576.0;
 

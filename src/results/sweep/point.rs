@@ -4,24 +4,23 @@ use std::path::Path;
 
 use nightsplat_photographs::tone::ToneCurve;
 
-use super::options::pair;
 use crate::train::Part;
 use crate::{Error, Result};
 
 /// The axis of presets, which other settings override.
-pub(super) const PRESET: &str = "preset";
+pub const PRESET: &str = "preset";
 /// The axis of model parts: [`PLAIN`], [`ALL_PARTS`], or parts by name.
-pub(super) const PARTS: &str = "parts";
+pub const PARTS: &str = "parts";
 /// On that axis: no part.
-pub(super) const PLAIN: &str = "plain";
+pub const PLAIN: &str = "plain";
 /// On that axis: every part.
-pub(super) const ALL_PARTS: &str = "all";
+pub const ALL_PARTS: &str = "all";
 /// The axis that is averaged over.
 pub(super) const SEED: &str = "seed";
 /// The axis of fixed black levels.
-pub(super) const OFFSET: &str = "offset";
+pub const OFFSET: &str = "offset";
 /// On that axis: the black level of alpha and beta.
-pub(super) const ADAPTIVE: &str = "adaptive";
+pub const ADAPTIVE: &str = "adaptive";
 
 /// Short names of axes, in the order of a point's name, with their settings.
 const AXES: [(&str, &str); 10] = [
@@ -39,15 +38,15 @@ const AXES: [(&str, &str); 10] = [
 
 /// A setting with a list of values.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct SweepAxis {
+pub struct SweepAxis {
     /// A name of [`AXES`], or the key of any other setting.
-    pub(super) key: String,
-    pub(super) values: Vec<String>,
+    pub key: String,
+    pub values: Vec<String>,
 }
 
 impl SweepAxis {
     /// The axis of a comma-separated list; commas within brackets or quotes do not separate.
-    pub(super) fn new(key: &str, list: &str) -> Result<Self> {
+    pub fn new(key: &str, list: &str) -> Result<Self> {
         let key = key.trim();
         let name = AXES.iter().find(|(_, setting)| *setting == key).map_or(key, |(name, _)| name);
         let mut axis = Self { key: name.to_owned(), values: vec![] };
@@ -70,12 +69,12 @@ impl SweepAxis {
         Ok(axis)
     }
 
-    pub(super) fn from_values(key: &str, values: &[&str]) -> Self {
+    pub fn from_values(key: &str, values: &[&str]) -> Self {
         Self { key: key.to_owned(), values: values.iter().map(|&value| value.to_owned()).collect() }
     }
 
     /// The axis of `KEY=LIST`, as `--grid` takes it.
-    pub(super) fn parse(text: &str) -> Result<Self> {
+    pub fn parse(text: &str) -> Result<Self> {
         let (key, list) = text
             .split_once('=')
             .ok_or_else(|| Error::Usage(format!("--grid {text} has no values; write KEY=V1,V2")))?;
@@ -83,7 +82,7 @@ impl SweepAxis {
     }
 
     /// Sort key of axes in a point's name: those of [`AXES`] first, the seed last.
-    pub(super) fn order(&self) -> (usize, &str) {
+    pub fn order(&self) -> (usize, &str) {
         let named = AXES.iter().position(|(name, _)| *name == self.key && *name != SEED);
         (named.unwrap_or(AXES.len() + usize::from(self.key == SEED)), &self.key)
     }
@@ -112,7 +111,7 @@ fn split(list: &str) -> Vec<String> {
 }
 
 /// The names of all curves.
-pub(super) fn all_curves() -> Vec<String> {
+pub fn all_curves() -> Vec<String> {
     ToneCurve::ALL.iter().map(|curve| curve.name().to_owned()).collect()
 }
 
@@ -125,24 +124,24 @@ fn curve(name: &str) -> String {
 
 /// The settings of a point.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct SweepPoint {
+pub struct SweepPoint {
     /// Axes and values, in the order of the name.
-    pub(super) values: Vec<(String, String)>,
+    pub values: Vec<(String, String)>,
 }
 
 impl SweepPoint {
-    pub(super) fn value(&self, key: &str) -> Option<&str> {
+    pub fn value(&self, key: &str) -> Option<&str> {
         self.values.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
     }
 
     /// The point without its seed.
-    pub(super) fn seedless(&self) -> Self {
+    pub fn seedless(&self) -> Self {
         let values = self.values.iter().filter(|(key, _)| key != SEED);
         Self { values: values.cloned().collect() }
     }
 
     /// The unique name of its run directory, such as `curve=ap3,seed=10`, the same in every sweep.
-    pub(super) fn name(&self) -> String {
+    pub fn name(&self) -> String {
         const LONGEST: usize = 120;
         let pairs: Vec<String> =
             self.values.iter().map(|(key, value)| format!("{key}={value}")).collect();
@@ -161,7 +160,7 @@ impl SweepPoint {
     }
 
     /// Its arguments for `train`.
-    pub(super) fn arguments(&self) -> Vec<String> {
+    pub fn arguments(&self) -> Vec<String> {
         let set = |key: &str, value: &str| pair("set", &format!("{key}={value}"));
         let of = |(key, value): &(String, String)| match key.as_str() {
             "curve" => pair(key, &curve(value)),
@@ -176,6 +175,15 @@ impl SweepPoint {
             }
         };
         self.values.iter().flat_map(of).collect()
+    }
+}
+
+/// An option and its value as arguments, joined if the value looks like an option.
+pub fn pair(long: &str, value: &str) -> Vec<String> {
+    if value.starts_with('-') {
+        vec![format!("--{long}={value}")]
+    } else {
+        vec![format!("--{long}"), value.to_owned()]
     }
 }
 

@@ -3,41 +3,41 @@
 use serde_json::Value;
 
 use super::point::{PARTS, PRESET, SEED, SweepPoint};
-use super::run::Run;
+use super::run::SweepRun;
 use crate::results::eval::{AGAINST, WITH_REFERENCE};
 use crate::results::run::{Progress, load_progress};
 
 /// The results of a sweep.
 #[derive(Clone, Debug)]
-pub(super) struct SweepResults {
+pub struct SweepResults {
     /// The axes along which points differ, without the seed.
-    pub(super) keys: Vec<String>,
+    pub keys: Vec<String>,
     /// Best PSNR first, points without a score last.
-    pub(super) rows: Vec<SweepRow>,
+    pub rows: Vec<SweepRow>,
     /// Names of the scores, as `metrics.json` has them below `mean`.
-    pub(super) scores: Vec<String>,
+    pub scores: Vec<String>,
     /// All seeds.
-    pub(super) seeds: Vec<String>,
+    pub seeds: Vec<String>,
     /// The number of runs, finished or not.
-    pub(super) runs: usize,
+    pub runs: usize,
     /// Axis and value of the baseline.
     baseline: Option<(&'static str, &'static str)>,
 }
 
 /// A point with all its seeds.
 #[derive(Clone, Debug)]
-pub(super) struct SweepRow {
+pub struct SweepRow {
     /// The point without its seed.
-    pub(super) point: SweepPoint,
+    pub point: SweepPoint,
     /// `metrics.json` of each finished run.
-    pub(super) metrics: Vec<Value>,
+    pub metrics: Vec<Value>,
     /// Intermediate scores of the first finished run.
-    pub(super) progress: Vec<Progress>,
+    pub progress: Vec<Progress>,
 }
 
 impl SweepResults {
     /// Reads the results of the finished `runs`; points without one have a row, too.
-    pub(super) fn new(runs: &[Run], baseline: Option<(&'static str, &'static str)>) -> Self {
+    pub fn new(runs: &[SweepRun], baseline: Option<(&'static str, &'static str)>) -> Self {
         let (mut rows, mut scores, mut seeds): (Vec<SweepRow>, Vec<String>, Vec<String>) =
             Default::default();
         for run in runs {
@@ -64,7 +64,7 @@ impl SweepResults {
     }
 
     /// Sorts the rows.
-    pub(super) fn from_rows(
+    pub fn from_rows(
         mut rows: Vec<SweepRow>,
         scores: Vec<String>,
         seeds: Vec<String>,
@@ -76,12 +76,12 @@ impl SweepResults {
         Self { keys: differing(&rows), rows, scores, seeds, runs: 0, baseline }
     }
 
-    pub(super) fn has_seeds(&self) -> bool {
+    pub fn has_seeds(&self) -> bool {
         self.seeds.len() > 1
     }
 
     /// The settings of a row as a label, without the axis `except`.
-    pub(super) fn label(&self, row: &SweepRow, except: Option<&str>) -> String {
+    pub fn label(&self, row: &SweepRow, except: Option<&str>) -> String {
         let speaks = |key: &str| {
             ["curve", PRESET, PARTS].contains(&key) || (except.is_none() && self.keys.len() == 1)
         };
@@ -99,7 +99,7 @@ impl SweepResults {
 
     /// The baseline and its name: of the rows with its value, the one with the fewest settings. `None` if there are
     /// several.
-    pub(super) fn baseline(&self) -> Option<(&SweepRow, String)> {
+    pub fn baseline(&self) -> Option<(&SweepRow, String)> {
         let (key, value) = self.baseline?;
         let matching = || self.rows.iter().filter(|row| row.point.value(key) == Some(value));
         let fewest = matching().map(|row| row.point.values.len()).min()?;
@@ -111,12 +111,12 @@ impl SweepResults {
 
 impl SweepRow {
     /// Mean over finished runs of the number at a JSON pointer in `metrics.json`.
-    pub(super) fn mean(&self, pointer: &str) -> Option<f64> {
+    pub fn mean(&self, pointer: &str) -> Option<f64> {
         mean(&self.values(pointer))
     }
 
     /// Sample standard deviation; `None` for fewer than two runs.
-    pub(super) fn deviation(&self, pointer: &str) -> Option<f64> {
+    pub fn deviation(&self, pointer: &str) -> Option<f64> {
         let values = self.values(pointer);
         let mean = mean(&values).filter(|_| values.len() > 1)?;
         let squares = values.iter().map(|value| (value - mean) * (value - mean));
@@ -124,12 +124,12 @@ impl SweepRow {
     }
 
     /// Mean of a score.
-    pub(super) fn score(&self, name: &str) -> Option<f64> {
+    pub fn score(&self, name: &str) -> Option<f64> {
         self.mean(&pointer(name))
     }
 
     /// Minimum and maximum of a score; `None` for fewer than two runs.
-    pub(super) fn extremes(&self, name: &str) -> Option<[f64; 2]> {
+    pub fn extremes(&self, name: &str) -> Option<[f64; 2]> {
         let values = self.values(&pointer(name));
         let least = values.iter().copied().min_by(f64::total_cmp)?;
         let greatest = values.iter().copied().max_by(f64::total_cmp)?;
@@ -137,12 +137,12 @@ impl SweepRow {
     }
 
     /// Whether the targets of a run depend on references.
-    pub(super) fn knows_references(&self) -> bool {
+    pub fn knows_references(&self) -> bool {
         self.metrics.iter().any(|metrics| metrics.get(WITH_REFERENCE).is_some())
     }
 
     /// The images that scores compare with, unless these are the references.
-    pub(super) fn against(&self) -> Option<&str> {
+    pub fn against(&self) -> Option<&str> {
         self.metrics.iter().find_map(|metrics| metrics.get(AGAINST)?.as_str())
     }
 

@@ -9,8 +9,8 @@ use nightsplat_photographs::metrics::Scores;
 
 use super::point::{ADAPTIVE, OFFSET};
 use super::rows::{SweepResults, SweepRow};
-use super::run::Run;
-use super::runner::FailedPoint;
+use super::run::FailedPoint;
+use super::run::SweepRun;
 use super::table::{ColumnStatistic, CsvColumn, Quantity};
 use crate::Result;
 use crate::gpu::Gpu;
@@ -20,7 +20,7 @@ use crate::results::report::{
 };
 
 /// The files of a leaderboard.
-pub(super) const FILES: [&str; 3] = ["leaderboard.csv", "leaderboard.md", "index.html"];
+pub const FILES: [&str; 3] = ["leaderboard.csv", "leaderboard.md", "index.html"];
 
 /// The heading of the charted score.
 const PSNR: &str = "PSNR, dB";
@@ -33,21 +33,21 @@ const MAX_PICTURES: usize = 8;
 
 /// The leaderboard of a sweep.
 #[derive(Clone, Debug)]
-pub(super) struct Leaderboard<'a> {
-    pub(super) rows: &'a SweepResults,
-    pub(super) title: String,
+pub struct Leaderboard<'a> {
+    pub rows: &'a SweepResults,
+    pub title: String,
     /// First paragraphs of the page.
-    pub(super) intro: Vec<String>,
+    pub intro: Vec<String>,
     /// Links of the page: address and text.
-    pub(super) links: Vec<[String; 2]>,
+    pub links: Vec<[String; 2]>,
     /// Mean delta0 of the adaptive black level.
-    pub(super) adaptive_offset: Option<f64>,
-    pub(super) failures: &'a [FailedPoint],
+    pub adaptive_offset: Option<f64>,
+    pub failures: &'a [FailedPoint],
 }
 
 impl Leaderboard<'_> {
     /// Writes [`FILES`] to `folder`.
-    pub(super) fn save(&self, folder: &Path, pictures: Option<Comparison>) -> Result<()> {
+    pub fn save(&self, folder: &Path, pictures: Option<Comparison>) -> Result<()> {
         let [csv, markdown, html] = FILES.map(|file| folder.join(file));
         write_whole(&csv, self.csv().as_bytes())?;
         write_whole(&markdown, self.markdown().as_bytes())?;
@@ -55,7 +55,7 @@ impl Leaderboard<'_> {
     }
 
     /// The rows with their scores and the differences to the baseline, if there is one.
-    pub(super) fn table(&self) -> NumberTable {
+    pub fn table(&self) -> NumberTable {
         let SweepResults { keys, rows, scores, .. } = self.rows;
         let has_seeds = self.rows.has_seeds();
         let mut columns = vec![];
@@ -106,9 +106,9 @@ impl Leaderboard<'_> {
     }
 
     /// The first test view with a reference image: photograph, reference, renders of the best rows.
-    pub(super) fn pictures(
+    pub fn pictures(
         &self,
-        runs: &[Run],
+        runs: &[SweepRun],
         dataset: &Dataset,
         gpu: &Gpu,
     ) -> Result<Option<Comparison>> {
@@ -139,7 +139,8 @@ impl Leaderboard<'_> {
         // Second, so that it stays in the row of the best renders.
         pictures.extend(reference.map(|image| picture("reference", String::new(), &image)));
         for row in &self.rows.rows {
-            let is_its = |run: &&Run| run.point.seedless() == row.point && run.metrics().is_some();
+            let is_its =
+                |run: &&SweepRun| run.point.seedless() == row.point && run.metrics().is_some();
             let Some(run) = runs.iter().find(is_its) else { continue };
             let metrics = run.metrics().unwrap_or_default();
             let score = |name: &str| metrics["views"][&view.name][name].as_f64();
@@ -166,7 +167,7 @@ impl Leaderboard<'_> {
     }
 
     /// The paragraphs of the page.
-    pub(super) fn notes(&self) -> Vec<String> {
+    pub fn notes(&self) -> Vec<String> {
         let mut notes = self.intro.clone();
         if let Some((_, name)) = self.rows.baseline() {
             notes.push(format!("Gains are differences to {name}."));

@@ -9,13 +9,13 @@ use crate::results::report::{Best, Column, NumberTable};
 
 /// A number in `metrics.json` of a run.
 #[derive(Clone, Debug)]
-pub(super) struct Quantity {
+pub struct Quantity {
     /// Its key in CSV and JSON.
-    pub(super) key: String,
+    pub key: String,
     /// Its JSON pointer in `metrics.json`.
-    pub(super) pointer: String,
+    pub pointer: String,
     /// Its heading, with the unit.
-    pub(super) name: String,
+    pub name: String,
     digits: usize,
     /// The displayed unit.
     unit: f64,
@@ -37,7 +37,7 @@ pub(super) const KEYS: [&str; 9] = [
 
 impl Quantity {
     /// By its key: one of [`KEYS`], or the name of a score in `metrics.json`, such as `r0/psnr` for R_0.
-    pub(super) fn new(key: &str) -> Self {
+    pub fn new(key: &str) -> Self {
         const MIB: f64 = 1_048_576.0;
         let cost = |pointer: &str, name: &str, digits, unit| {
             let [key, pointer, name] = [key, pointer, name].map(str::to_owned);
@@ -69,14 +69,14 @@ impl Quantity {
     }
 
     /// The mean over the runs of a row, in the displayed unit.
-    pub(super) fn mean(&self, row: &SweepRow) -> Option<f64> {
+    pub fn mean(&self, row: &SweepRow) -> Option<f64> {
         Some(row.mean(&self.pointer)? / self.unit)
     }
 }
 
 /// What a column has of the runs of a row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum ColumnStatistic {
+pub enum ColumnStatistic {
     Mean,
     /// The sample standard deviation.
     Deviation,
@@ -85,18 +85,15 @@ pub(super) enum ColumnStatistic {
 }
 
 /// A column of CSV: its name, and a cell per row.
-pub(super) struct CsvColumn {
+#[derive(Debug)]
+pub struct CsvColumn {
     name: String,
     cells: Vec<String>,
 }
 
 impl SweepResults {
     /// A table of these columns.
-    pub(super) fn table(
-        &self,
-        title: &str,
-        columns: &[(Quantity, ColumnStatistic)],
-    ) -> NumberTable {
+    pub fn table(&self, title: &str, columns: &[(Quantity, ColumnStatistic)]) -> NumberTable {
         let baseline = self.baseline();
         let column = |(quantity, statistic): &(Quantity, ColumnStatistic)| {
             let Quantity { name, digits, best, .. } = quantity;
@@ -129,7 +126,7 @@ impl SweepResults {
     }
 
     /// A line per row: its settings, then these columns.
-    pub(super) fn csv(&self, columns: Vec<CsvColumn>) -> String {
+    pub fn csv(&self, columns: Vec<CsvColumn>) -> String {
         let setting = |key: &String| {
             self.csv_column(key, |_, row| row.point.value(key).unwrap_or_default().to_string())
         };
@@ -140,18 +137,14 @@ impl SweepResults {
     }
 
     /// A column of CSV; `cell` takes the index of a row and the row.
-    pub(super) fn csv_column(
-        &self,
-        name: &str,
-        cell: impl Fn(usize, &SweepRow) -> String,
-    ) -> CsvColumn {
+    pub fn csv_column(&self, name: &str, cell: impl Fn(usize, &SweepRow) -> String) -> CsvColumn {
         let cells = self.rows.iter().enumerate().map(|(index, row)| cell(index, row));
         CsvColumn { name: name.to_owned(), cells: cells.collect() }
     }
 
     /// The columns of CSV of a quantity, with all digits and in the unit of `metrics.json`: the mean and, if requested,
     /// the standard deviation.
-    pub(super) fn csv_numbers(&self, key: &str, with_deviation: bool) -> Vec<CsvColumn> {
+    pub fn csv_numbers(&self, key: &str, with_deviation: bool) -> Vec<CsvColumn> {
         let pointer = Quantity::new(key).pointer;
         let mut columns = vec![self.csv_column(key, |_, row| number(row.mean(&pointer)))];
         if with_deviation {
