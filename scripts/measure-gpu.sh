@@ -22,7 +22,7 @@
 #         pipelines.jsonl   registers, spills and shared memory of every kernel, by the driver
 #         ab-*.json         steps with prototypes in place of kernels, and with none, in turn
 #         lita-*.jsonl      steps of LITA in single and half precision, with and without crops, and its pipelines
-#         tune*.json        every tile, of the trained model, the synthetic scene, and with subgroups of N lanes
+#         tune*.json        every tile and sort, of the trained model, the synthetic scene, and with subgroups of N lanes
 #         checked.json      every pass against its reference: errors in units of their bounds
 #         hashes.txt        the models of equal runs, of one without push descriptors, and of one in other batches
 #         validation.txt    messages of the validation layer over two steps
@@ -31,10 +31,10 @@
 #         lom.txt           training by the paper's protocol, plain and with every part: scores, or the last steps
 #         growth.txt        how time and memory grow
 #
-# Variables. pack: PROFILE=release, TESTS (the test targets; all; `none`), and NIGHTSPLAT_PROTOTYPES, a folder of kernels to
-# compare with those of the program: blend_forward.comp and blend_backward.comp, with the interfaces of those, subst.py,
-# which fits them to the modules of a run, and ../wrap.c, a driver around the real one that replaces modules by hash;
-# PROTOTYPE_FLAGS, for glslangValidator. run: ONLY, the experiments by the names of their functions (all); DRIVER, the
+# Variables. pack: PROFILE=release, TESTS (the test targets; all; none), and NIGHTSPLAT_PROTOTYPES, a folder of kernels
+# to compare with those of the program: blend_forward.comp and blend_backward.comp, with the interfaces of those,
+# subst.py, which fits them to the modules of a run, and ../wrap.c, a driver around the real one that replaces modules by
+# hash; PROTOTYPE_FLAGS, for glslangValidator. run: ONLY, the experiments by the names of their functions (all); DRIVER, the
 # library of the real driver, if it is not NVIDIA's; GSPLAT.
 set -euo pipefail
 
@@ -393,9 +393,12 @@ tune() {
     note "$(sed -n '/^  "tiles": \[/,/^  \]/p' "$found/$name.json" | tr -d ' \n')"
 }
 
+# Every tile with both sorts; then steps with what was faster.
 tiles() {
     local lanes
     NIGHTSPLAT_TUNE=$work/tiles.json tune tune 100 $TUNE
+    NIGHTSPLAT_TUNE=$work/tiles.json timed bench-many-tuned 20 $MANY
+    NIGHTSPLAT_TUNE=$work/tiles.json timed bench-small-tuned 15 $SMALL
     for lanes in $(sed -n 's/.*NIGHTSPLAT_SUBGROUP: or \([0-9, ]*\)).*/\1/p' "$found/doctor.txt" | tr -d ,); do
         NIGHTSPLAT_SUBGROUP=$lanes NIGHTSPLAT_TUNE=$work/tiles-$lanes.json tune "tune-$lanes" 60 $TUNE
     done
@@ -474,8 +477,7 @@ run() {
         *) cat "$found/doctor.txt" && fail "no device is found" ;;
     esac
 
-    # What counts most comes first: times, without checks. Not here, for want of kernels or of their settings: the tile
-    # sort, Adam in 16 bits over whole Gaussians, the lengths of segments.
+    # What counts most comes first: times, without checks. Not here, for want of settings: the lengths of segments.
     experiment 60 phases
     experiment 120 baseline
     experiment 150 prototypes

@@ -81,7 +81,7 @@ pub use statistics::{Resources, Statistic};
 pub use subgroups::SUBGROUP_VARIABLE;
 pub use submission::{PassTime, Submission};
 pub use supported::PUSH_VARIABLE;
-pub use tuning::{TUNE_VARIABLE, Tile, TunedTile};
+pub use tuning::{Sorting, TUNE_VARIABLE, Tile, TunedTile};
 
 use crate::{Error, Result};
 

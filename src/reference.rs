@@ -65,6 +65,7 @@ mod pack_weights;
 mod packed;
 pub mod parameter_terms;
 mod photograph_light;
+mod place_pairs;
 mod product;
 mod product_backward;
 pub mod project;
@@ -83,12 +84,14 @@ mod self_test;
 pub mod sh;
 mod smoothing_floor;
 mod sort_downsweep;
+mod sort_tiles;
 mod sort_upsweep;
 pub mod splat;
 pub mod ssim;
 mod ssim_backward;
 mod ssim_forward;
 mod structure_l1;
+mod tile_begins;
 
 use glam::UVec2;
 

@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use super::scene::BenchScene;
 use super::{Bench, median, stages, total};
 use crate::Result;
-use crate::gpu::{Buffer, Resources, Tile, TunedTile};
+use crate::gpu::{Buffer, Resources, Sorting, Tile, TunedTile};
 use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
 use crate::splats::scene::{DeviceGaussians, Features, Layout, MAX_SH_DEGREE};
 
@@ -20,6 +20,9 @@ const SIZES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8
 /// ends one loop over all lanes and begins another.
 const SUBGROUPS: [u32; 3] = [1, 2, 4];
 const SHARED_PIXELS: u32 = 256;
+
+/// Sorts; processors have the first.
+const SORTS: [Sorting; 2] = [Sorting::Whole, Sorting::Tiles];
 
 /// Colour only and all features: 3 and 11 channels.
 const FEATURES: [Features; 2] = [Features::NONE, Features::ALL];
@@ -37,9 +40,10 @@ struct Case {
     tiles: Vec<TileTiming>,
 }
 
-/// Measurements of one tile.
+/// Measurements of one tile with one sort.
 struct TileTiming {
     tile: Tile,
+    sorting: Sorting,
     intersections: u32,
     /// Largest and mean difference from the render of the first tile.
     differences: (f32, f64),
@@ -93,20 +97,20 @@ impl TileTimings {
     }
 }
 
-/// The tile with the least sum over sizes of its time relative to the fastest at that size. One whose kernels spill is
+/// The tile and the sort with the least sum over sizes of its time relative to the fastest at that size. One whose kernels spill is
 /// taken only where all do: the timed scene leaves caches to spills that a larger one does not.
 fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
     let cases = || cases.iter().filter(|case| case.channels == channels);
-    let cost = |tile: Tile| {
+    let choices = cases().next()?.tiles.iter().map(TileTiming::choice);
+    let cost = |choice: (Tile, Sorting)| {
         let relative = |case: &Case| {
-            let timing = case.candidates().find(|measured| measured.tile == tile);
+            let timing = case.candidates().find(|measured| measured.choice() == choice);
             timing.map_or(f64::INFINITY, |timing| timing.rasteriser() / case.least())
         };
         cases().map(relative).sum::<f64>()
     };
-    let tiles = cases().next()?.tiles.iter().map(|measured| measured.tile);
-    let tile = tiles.min_by(|&a, &b| cost(a).total_cmp(&cost(b)))?;
-    Some(TunedTile { channels, tile })
+    let (tile, sorting) = choices.min_by(|&a, &b| cost(a).total_cmp(&cost(b)))?;
+    Some(TunedTile { channels, tile, sorting })
 }
 
 impl Case {
@@ -121,25 +125,32 @@ impl Case {
             let is_large = tile.subgroups == 1 || pixels >= SHARED_PIXELS;
             is_large && gpu.properties().suits_tile(*tile)
         };
-        let tiles: Vec<_> = SIZES.into_iter().flat_map(sharing).filter(is_tried).collect();
+        let tiles = SIZES.into_iter().flat_map(sharing).filter(is_tried);
+        // A processor sorts tiles by themselves with one subgroup each, whose every step is a loop of its own.
+        let sorts = if gpu.properties().is_cpu { &SORTS[..1] } else { &SORTS };
+        let choices: Vec<_> =
+            tiles.flat_map(|tile| sorts.iter().map(move |&sorting| (tile, sorting))).collect();
         // Compiling takes longer than everything else.
-        let compiled = tiles.into_par_iter().map(|tile| {
-            let settings = RenderSettings { tile: Some(tile), ..scene.render_settings() };
+        let compiled = choices.into_par_iter().map(|(tile, sorting)| {
+            let (tile_of, sorting_of) = (Some(tile), Some(sorting));
+            let settings =
+                RenderSettings { tile: tile_of, sorting: sorting_of, ..scene.render_settings() };
             let renderer = Renderer::new(gpu, settings)?;
             let resources = renderer.blend_statistics()?;
             let resources = resources
                 .map(|all| all.each_ref().map(|kernel| Resources::from_statistics(kernel)));
-            Ok((tile, renderer, resources))
+            Ok(((tile, sorting), renderer, resources))
         });
         let compiled = compiled.collect::<Result<Vec<_>>>()?;
         let (mut candidates, mut first) = (vec![], None);
-        for (tile, mut renderer, resources) in compiled {
+        for ((tile, sorting), mut renderer, resources) in compiled {
             renderer.reserve(gaussians.count, [camera])?;
             let render = renderer.render_channels(&on_device, camera, &OPTIONS)?;
             let first = first.get_or_insert_with(|| render.clone());
             let status = Status::from_words(&gpu.read(renderer.status())?);
             let measured = TileTiming {
                 tile,
+                sorting,
                 intersections: status.intersections,
                 differences: differences(&render, first),
                 times: [0.0; 3],
@@ -189,17 +200,18 @@ impl Case {
 
     fn as_text(&self) -> String {
         let Self { channels, size: [width, height], gaussians, .. } = self;
-        let head = ["tile", "blend forward", "backward", "rasteriser, ms", "intersections", ""];
+        let head =
+            ["tile", "sorted", "blend forward", "backward", "rasteriser, ms", "intersections", ""];
         let mut rows = vec![head.map(str::to_owned).to_vec()];
         rows.extend(self.tiles.iter().map(|measured| {
-            let TileTiming { tile, intersections, times, .. } = measured;
+            let TileTiming { tile, sorting, intersections, times, .. } = measured;
             let note = match measured.agrees() {
                 false => "renders differently",
                 true if measured.rasteriser() == self.least() => "fastest",
                 true if measured.spills() => "spills registers",
                 true => "",
             };
-            let mut row = vec![tile.to_string()];
+            let mut row = vec![tile.to_string(), sorting.to_string()];
             row.extend(times.map(|milliseconds| format!("{milliseconds:.3}")));
             row.extend([intersections.to_string(), note.to_owned()]);
             row
@@ -258,6 +270,10 @@ impl Pass {
 }
 
 impl TileTiming {
+    fn choice(&self) -> (Tile, Sorting) {
+        (self.tile, self.sorting)
+    }
+
     fn rasteriser(&self) -> f64 {
         self.times[2]
     }
@@ -279,6 +295,7 @@ impl TileTiming {
         );
         json!({
             "tile": self.tile,
+            "sorting": self.sorting,
             "intersections": self.intersections,
             "agrees": self.agrees(),
             "spills": self.spills(),
@@ -319,6 +336,7 @@ mod tests {
     fn case(channels: usize, times: &[([u32; 2], f64, f32)]) -> Case {
         let measured = |&(size, rasteriser, difference): &([u32; 2], _, _)| TileTiming {
             tile: size.into(),
+            sorting: Sorting::Whole,
             intersections: 0,
             differences: (difference, 0.0),
             times: [0.0, 0.0, rasteriser],
@@ -335,8 +353,12 @@ mod tests {
             case(3, &[(small, 30.0, 0.0), (large, 20.0, 0.0), (wrong, 10.0, f32::NAN)]),
             case(11, &[(small, 5.0, 0.0), (large, 6.0, 0.0)]),
         ];
-        assert_eq!(fastest(&cases, 3), Some(TunedTile { channels: 3, tile: large.into() }));
-        assert_eq!(fastest(&cases, 11), Some(TunedTile { channels: 11, tile: small.into() }));
+        let tuned = |channels, tile: [u32; 2]| {
+            let tile = tile.into();
+            TunedTile { channels, tile, sorting: Sorting::Whole }
+        };
+        assert_eq!(fastest(&cases, 3), Some(tuned(3, large)));
+        assert_eq!(fastest(&cases, 11), Some(tuned(11, small)));
     }
 
     #[test]

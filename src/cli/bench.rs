@@ -132,7 +132,9 @@ fn tune(bench: &Bench, sizes: &[[u32; 2]], as_json: bool) -> Result<()> {
     if !bench.gpu.properties().has_pipeline_statistics {
         print("registers and spills: not reported by the driver")?;
     }
-    let tile = |TunedTile { channels, tile }: &TunedTile| format!("{tile} at {channels} channels");
+    let tile = |TunedTile { channels, tile, sorting }: &TunedTile| {
+        format!("{tile} at {channels} channels, {sorting}")
+    };
     let fastest = tuning.fastest.iter().map(tile).collect::<Vec<_>>().join(", ");
     match &tuning.file {
         Some(_) => print(format_args!("fastest: {fastest}"))?,

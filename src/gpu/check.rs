@@ -26,6 +26,13 @@ pub enum Tolerance {
     Bytes,
     /// One partial sum per workgroup, of which only the total counts: the device chooses the partition.
     Sum(f64),
+    /// Integers in groups of `width`, in any order between one of `begins`, which are numbers of groups, and the next.
+    AnyOrder {
+        /// Words of a group.
+        width: usize,
+        /// Ascending; the groups before the first and after the last are where they are.
+        begins: Vec<usize>,
+    },
 }
 
 /// The result of one pass of a checked recording.
@@ -162,6 +169,12 @@ impl Versions<'_> {
         let number = |word: u32| {
             if self.is_float { f64::from(f32::from_bits(word)) } else { f64::from(word) }
         };
+        if let Tolerance::AnyOrder { width, begins } = tolerance {
+            let [device, reference] =
+                [self.device, self.reference].map(|words| in_order(words, *width, begins));
+            let sorted = Versions { device: &device, reference: &reference, ..*self };
+            return sorted.compare(&Tolerance::Exact, workgroups);
+        }
         let mut comparison = BufferComparison::default();
         let mut from = 0;
         if let Tolerance::Sum(bound) = *tolerance {
@@ -189,7 +202,11 @@ impl Versions<'_> {
             }
             let (device, reference) = (number(self.device[i]), number(expected));
             let bound = match tolerance {
-                Tolerance::Exact | Tolerance::Sum(_) | Tolerance::Halves | Tolerance::Bytes => 0.0,
+                Tolerance::Exact
+                | Tolerance::Sum(_)
+                | Tolerance::Halves
+                | Tolerance::Bytes
+                | Tolerance::AnyOrder { .. } => 0.0,
                 Tolerance::Roundings(n) => n * ROUNDING * reference.abs() + flushed(1),
                 Tolerance::Each(bounds) => bounds
                     .get(i)
@@ -199,6 +216,18 @@ impl Versions<'_> {
         }
         comparison
     }
+}
+
+/// The words with the groups between two of `begins` sorted.
+fn in_order(words: &[u32], width: usize, begins: &[usize]) -> Vec<u32> {
+    let mut sorted = words.to_vec();
+    for run in begins.windows(2) {
+        let words = &words[width * run[0]..width * run[1]];
+        let mut groups: Vec<&[u32]> = words.chunks_exact(width).collect();
+        groups.sort_unstable();
+        sorted[width * run[0]..width * run[1]].copy_from_slice(&groups.concat());
+    }
+    sorted
 }
 
 /// Of two words with four bytes each, the pair of bytes that is farther apart.
@@ -322,6 +351,20 @@ mod tests {
             assert_eq!((off.count, off.error), if sums { (0, 0.0) } else { (1, f64::INFINITY) });
             assert_eq!(compare(&[0.0, 1.0], &[1.0, f32::NAN], &tolerance).error, f64::INFINITY);
         }
+    }
+
+    #[test]
+    fn groups_of_a_run_are_compared_in_any_order_and_others_where_they_are() {
+        let compare = |device: &[u32], reference: &[u32]| {
+            let versions = Versions { before: &[0; 8], device, reference, is_float: false };
+            versions.compare(&Tolerance::AnyOrder { width: 2, begins: vec![1, 3] }, 1).count
+        };
+        let reference = [9, 8, 1, 2, 3, 4, 5, 6];
+        assert_eq!(compare(&[9, 8, 3, 4, 1, 2, 5, 6], &reference), 0);
+        assert_eq!(compare(&[9, 8, 3, 4, 2, 1, 5, 6], &reference), 2, "within a group");
+        assert_eq!(compare(&[9, 8, 1, 2, 1, 2, 5, 6], &reference), 2, "twice the same");
+        assert_eq!(compare(&[1, 2, 9, 8, 3, 4, 5, 6], &reference), 4, "before the first run");
+        assert_eq!(compare(&[9, 8, 1, 2, 5, 6, 3, 4], &reference), 4, "across the end of a run");
     }
 
     #[test]

@@ -69,6 +69,26 @@ impl fmt::Display for Tile {
     }
 }
 
+/// How the intersections of a view are sorted by tile and depth. The order is the same.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Sorting {
+    /// All Gaussians by depth, then all intersections by tile.
+    #[default]
+    Whole,
+    /// Each tile by itself.
+    Tiles,
+}
+
+impl fmt::Display for Sorting {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(match self {
+            Self::Whole => "sorted as a whole",
+            Self::Tiles => "sorted by tile",
+        })
+    }
+}
+
 /// The fastest tile for renders of `channels` values per pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -77,6 +97,9 @@ pub struct TunedTile {
     pub channels: usize,
     /// The tile.
     pub tile: Tile,
+    /// The sort that is faster with it.
+    #[serde(default)]
+    pub sorting: Sorting,
 }
 
 /// The measurements, with device and driver.
@@ -114,11 +137,11 @@ impl Properties {
 impl Gpu {
     /// The tile that was fastest on this device and driver for the nearest number of channels; `None` without
     /// measurements, or where the device is lent or opened for validation.
-    pub(crate) fn tuned_tile(&self, channels: usize) -> Option<Tile> {
+    pub(crate) fn tuned_tile(&self, channels: usize) -> Option<TunedTile> {
         let path = self.tuning_path()?;
         let tiles = self.shared.tuned_tiles.get_or_init(|| load(path, self.properties()));
         let far = |tuned: &&TunedTile| tuned.channels.abs_diff(channels);
-        tiles.iter().min_by_key(far).map(|tuned| tuned.tile)
+        tiles.iter().min_by_key(far).copied()
     }
 
     /// Saves the measurements for later runs; returns the file, or `None` where there is none.
@@ -249,13 +272,16 @@ mod tests {
     #[test]
     fn only_an_intact_file_of_this_device_and_driver_is_used() {
         let text = |device: &str, driver: &str, tile: [u32; 2]| {
-            let tiles = vec![TunedTile { channels: 3, tile: tile.into() }];
+            let tiles = vec![TunedTile { channels: 3, tile: tile.into(), sorting: Sorting::Tiles }];
             let tuning = Tuning { device: device.to_owned(), driver: driver.to_owned(), tiles };
             serde_json::json!(tuning).to_string()
         };
         let read = |text: &str| tiles(text.as_bytes(), &properties());
         let whole = text("Abacus 3000", "beads 1.0", [16, 4]);
-        assert_eq!(read(&whole).unwrap(), [TunedTile { channels: 3, tile: [16, 4].into() }]);
+        assert_eq!(
+            read(&whole).unwrap(),
+            [TunedTile { channels: 3, tile: [16, 4].into(), sorting: Sorting::Tiles }]
+        );
         let refused = |text: &str, part: &str| {
             let problem = read(text).unwrap_err();
             assert!(problem.contains(part) && !problem.contains('\n'), "{problem}");

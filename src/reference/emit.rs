@@ -4,7 +4,8 @@ use super::rounding::UNIT;
 use super::splat::{extent_error, splat_tile_rows, splat_tiles};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
-use crate::kernels::emit::{Constants, Kernel, NO_TILE, Params, Slices, Tolerances};
+use crate::kernels::emit::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::no_tile::NO_TILE;
 
 /// The tiles that the splat covers, row by row.
 fn covered(params: &Params, constants: &Constants, splat: &ProjectedSplat) -> Vec<u32> {
@@ -48,16 +49,23 @@ impl Reference for Kernel {
             let padding = std::iter::repeat(NO_TILE);
             for (slot, tile) in reserved.zip(covered.into_iter().chain(padding)) {
                 slices.tiles[slot as usize] = tile;
-                slices.intersection_ids[slot as usize] = slot;
                 slices.gaussian_ids[slot as usize] = id;
+                slices.intersection_ids[slot as usize] = slot;
+                if constants.sorts_tiles && tile != NO_TILE {
+                    let size = &mut slices.tile_sizes[tile as usize];
+                    slices.intersection_ids[slot as usize] = *size;
+                    *size += 1;
+                }
             }
         }
     }
 
     /// If an edge of the ellipse is within rounding of an edge of a tile, the Gaussian may or may not cover the tile.
+    /// The order of arrival in a tile is any; `place_pairs` shows whether every place is given once.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let mut tiles = vec![0.0; slices.tiles.len()];
         let mut intersection_ranges = vec![0.0; 2 * slices.intersection_ranges.len()];
+        let mut uncertain = 0.0;
         for (id, reserved, is_whole) in reserved(params, constants, &slices) {
             if reserved.is_empty() || !is_whole {
                 continue;
@@ -67,11 +75,17 @@ impl Reference for Kernel {
             if moved(splat).iter().any(|splat| covered(params, constants, splat) != exact) {
                 tiles[reserved.start as usize..reserved.end as usize].fill(f64::INFINITY);
                 intersection_ranges[2 * id as usize + 1] = reserved.len() as f64;
+                uncertain += 1.0;
             }
         }
         Tolerances {
             tiles: Tolerance::Each(tiles),
             intersection_ranges: Tolerance::Each(intersection_ranges),
+            tile_sizes: Tolerance::Each(vec![uncertain; slices.tile_sizes.len()]),
+            intersection_ids: match constants.sorts_tiles {
+                true => Tolerance::Each(vec![f64::INFINITY; slices.intersection_ids.len()]),
+                false => Tolerance::Exact,
+            },
             ..Tolerances::default()
         }
     }

@@ -1,7 +1,8 @@
 //! The differentiable rasteriser: Gaussians and a camera to a render, and the gradient of the render to theirs.
 //!
 //! ```text
-//! project -> sort by depth -> order_counts -> emit -> sort by tile -> blend_forward
+//! project -> sort by depth -> order_counts -> emit -> sort by tile -> blend_forward      as a whole
+//! project -> order_counts -> emit -> places in tiles -> sort of each tile -> blend_forward, which a device may do faster
 //!     -> [loss] -> blend_backward -> project_backward
 //! ```
 //!
@@ -38,7 +39,7 @@ use crate::kernels::{
 };
 use crate::splats::batches::GradientKind;
 use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
-use crate::splats::sort::{Count, RadixSort};
+use crate::splats::sort::{Count, RadixSort, TileSort, UnsortedTiles};
 use crate::{Error, Result};
 
 pub use buffers::RenderBuffers;
@@ -102,8 +103,7 @@ pub struct Renderer {
     blend_depths: Option<Pipeline<blend_forward::Kernel>>,
     /// Absent where the purpose is to show.
     blend_backward: Option<Pipeline<blend_backward::Kernel>>,
-    depth_sort: RadixSort,
-    tile_sort: RadixSort,
+    sort: Sort,
     frame: RenderBuffers,
     /// Rendered before those of every view, and without gradients.
     context: Option<DeviceGaussians>,
@@ -112,6 +112,15 @@ pub struct Renderer {
     host_targets: Option<HostTargets>,
     /// Lights the colours.
     lamp: Option<DeviceLamp>,
+}
+
+/// The sort of the intersections by tile and depth.
+#[derive(Debug)]
+enum Sort {
+    /// All Gaussians by depth, then all intersections by tile.
+    Whole { by_depth: RadixSort, by_tile: RadixSort },
+    /// Each tile by itself.
+    Tiles(TileSort),
 }
 
 /// How the last channel of a render keeps the depth in the view.
@@ -428,9 +437,12 @@ impl Renderer {
         view: &KernelView<'_>,
         capacity: Option<u32>,
     ) -> Result<()> {
-        let frame = &mut self.frame;
-        let all = Count { counts: &frame.gaussian_counts, index: 0 };
-        self.depth_sort.record(pass, all, &mut frame.depth_keys, &mut frame.ids, DEPTH_BITS)?;
+        let tile_count = view.tile_count();
+        let Self { frame, sort, .. } = self;
+        if let Sort::Whole { by_depth, .. } = sort {
+            let all = Count { counts: &frame.gaussian_counts, index: 0 };
+            by_depth.record(pass, all, &mut frame.depth_keys, &mut frame.ids, DEPTH_BITS)?;
+        }
         pass.dispatch(
             &self.order_counts,
             &order_counts::Params {
@@ -463,19 +475,29 @@ impl Renderer {
                 intersection_ids: frame.intersection_ids.slice_mut(),
                 gaussian_ids: frame.gaussian_ids.slice_mut(),
                 intersection_ranges: frame.intersection_ranges.slice_mut(),
+                tile_sizes: match sort {
+                    Sort::Whole { .. } => frame.no_sizes.slice_mut(),
+                    Sort::Tiles(tiles) => tiles.sizes.slice_mut(),
+                },
             },
             Threads::Exactly([gaussian_count, 1, 1]),
         )?;
-        let intersection_ranges = Count { counts: &frame.counts, index: 0 };
-        // One value more than there are tiles: padding sorts last.
-        let bits = u32::BITS - view.tile_count().leading_zeros();
-        self.tile_sort.record(
-            pass,
-            intersection_ranges,
-            &mut frame.tiles,
-            &mut frame.intersection_ids,
-            bits,
-        )
+        let (tiles, intersection_ids) = (&mut frame.tiles, &mut frame.intersection_ids);
+        match sort {
+            Sort::Whole { by_tile, .. } => {
+                let intersections = Count { counts: &frame.counts, index: 0 };
+                // One value more than there are tiles: padding sorts last.
+                let bits = u32::BITS - tile_count.leading_zeros();
+                by_tile.record(pass, intersections, tiles, intersection_ids, bits)
+            }
+            Sort::Tiles(sort) => {
+                let (counts, gaussian_ids) = (&frame.counts, &frame.gaussian_ids);
+                let depth_keys = &frame.depth_keys;
+                let unsorted =
+                    UnsortedTiles { counts, gaussian_ids, depth_keys, tiles, intersection_ids };
+                sort.record(pass, tile_count, unsorted)
+            }
+        }
     }
 
     /// The number of Gaussians that precede those of a view.

@@ -1,6 +1,6 @@
-//! Exclusive scan and stable radix sort of arrays whose length is on the device.
+//! Exclusive scan and stable radix sort of arrays whose length is on the device, and the sort of each tile by itself.
 //!
-//! Both are reduce-then-scan: an upsweep sums partitions of consecutive items, the last of its workgroups scans the
+//! The first two are reduce-then-scan: an upsweep sums partitions of consecutive items, the last of its workgroups scans the
 //! sums, and a downsweep finishes within the partitions. A decoupled look-back would need one kernel instead of two,
 //! but also forward-progress guarantees that Vulkan does not provide. One subgroup owns a partition, and results are
 //! bit-identical on every device and in every run. A dispatch has a subgroup for every partition of the buffers'
@@ -9,9 +9,11 @@
 
 mod radix;
 mod scan;
+mod tiles;
 
 pub use radix::RadixSort;
 pub use scan::Scan;
+pub use tiles::{TileSort, UnsortedTiles};
 
 use crate::gpu::Buffer;
 use crate::{Error, Result};

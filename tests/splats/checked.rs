@@ -7,7 +7,7 @@ use std::path::Path;
 use glam::{DVec2, DVec3};
 use nightsplat::Error;
 use nightsplat::gpu::testing::{Defect, gpu, gpu_with, is_checked, with_defect};
-use nightsplat::gpu::{CheckReport, Gpu};
+use nightsplat::gpu::{CheckReport, Gpu, Sorting};
 use nightsplat::networks::NetworkVariant;
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::packed_sh::StorageFormat;
@@ -286,6 +286,15 @@ fn runs_of_whole_segments_and_of_one_splat_more_or_less_agree_with_their_referen
         for (whole, segments) in whole.iter().zip(&segments) {
             assert!((whole - segments).abs() <= 1e-5 * largest, "{count}: {whole} {segments}");
         }
+    }
+}
+
+#[test]
+fn the_passes_of_a_render_whose_tiles_are_sorted_by_themselves_agree_with_their_references() {
+    for channels in [3, 11] {
+        let mut setup = Setup::opaque_above(channels);
+        setup.settings.sorting = Some(Sorting::Tiles);
+        assert_passes_agree(&setup);
     }
 }
 

@@ -7,6 +7,7 @@ use std::collections::HashSet;
 use glam::{DVec2, DVec3, UVec2, Vec2, Vec3};
 use nightsplat::gpu::testing::{gpu, gpu_with};
 use nightsplat::gpu::{Threads, Tile};
+use nightsplat::kernels::no_tile::NO_TILE;
 use nightsplat::kernels::status::STATUS_TILE_LIMIT;
 use nightsplat::kernels::{
     self, ProjectedSplat, blend_forward, emit, order_counts, project_backward,
@@ -79,15 +80,16 @@ fn emitted(count: u32, tile_counts: Vec<u32>) -> (Vec<u32>, Vec<u32>, Vec<u32>, 
     let (counts, sorted_ids) = (vec![count], vec![0, 1, 2]);
     let (sums, intersection_offsets) = (vec![0], vec![0, 4, 8]);
     let [tiles, intersection_ids, gaussian_ids] = [0; 3].map(|_| vec![7u32; 16]);
-    let intersection_ranges = vec![UVec2::splat(7); 3];
-    run_kernel!(
+    let (intersection_ranges, tile_sizes) = (vec![UVec2::splat(7); 3], vec![0; 1]);
+    let (tiles, intersection_ids, gaussian_ids, intersection_ranges, _) = run_kernel!(
         emit,
         emit::Constants { partition_size: 256, ..Default::default() },
         emit::Params { size: UVec2::new(32, 32), gaussian_count: 3, tile_columns: 2 },
         Threads::Exactly([3, 1, 1]),
         [counts, sorted_ids, intersection_offsets, sums, splats, tile_counts],
-        [tiles, intersection_ids, gaussian_ids, intersection_ranges]
-    )
+        [tiles, intersection_ids, gaussian_ids, intersection_ranges, tile_sizes]
+    );
+    (tiles, intersection_ids, gaussian_ids, intersection_ranges)
 }
 
 #[test]
@@ -193,13 +195,14 @@ fn emit_wide(count: u32, size: UVec2, extra: u32) -> (Vec<u32>, Vec<UVec2>, u32)
     let intersection_offsets: Vec<u32> = (0..count).map(|rank| rank * per_splat).collect();
     let [tiles_, intersection_ids, gaussian_ids] = [0; 3].map(|_| vec![7u32; counts[0] as usize]);
     let (tiles, intersection_ranges) = (tiles_, vec![UVec2::ZERO; count as usize]);
-    let (tiles, _, _, intersection_ranges) = run_kernel!(
+    let tile_sizes = vec![0; 1];
+    let (tiles, _, _, intersection_ranges, _) = run_kernel!(
         emit,
         constants,
         emit::Params { size, gaussian_count: count, tile_columns: size.x.div_ceil(tile.x) },
         Threads::Exactly([count, 1, 1]),
         [counts, sorted_ids, intersection_offsets, sums, splats, tile_counts],
-        [tiles, intersection_ids, gaussian_ids, intersection_ranges]
+        [tiles, intersection_ids, gaussian_ids, intersection_ranges, tile_sizes]
     );
     (tiles, intersection_ranges, per_splat)
 }
@@ -271,7 +274,7 @@ fn slots_that_no_tile_fills_are_padding_and_do_not_change_the_sums() {
     for size in [UVec2::new(40, 20), UVec2::new(400, 200)] {
         let (tiles, intersection_ranges, per_splat) = emit_wide(11, size, 5);
         let is_padding = |slot: usize| slot as u32 % per_splat >= per_splat - 5;
-        assert!((0..tiles.len()).all(|slot| (tiles[slot] == emit::NO_TILE) == is_padding(slot)));
+        assert!((0..tiles.len()).all(|slot| (tiles[slot] == NO_TILE) == is_padding(slot)));
         // No tile writes the records of padding.
         let record = |slot: usize| [if is_padding(slot) { f32::NAN } else { 1.0 }; 12];
         let gradient_records: Vec<Record> = (0..tiles.len()).map(record).collect();

@@ -4,8 +4,8 @@ use std::collections::HashSet;
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, DVec4, Vec2, Vec3};
-use nightsplat::gpu::Tile;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::{Sorting, Tile};
 use nightsplat::kernels::ProjectedSplat;
 use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
@@ -226,6 +226,22 @@ fn counting_and_emitting_agree() {
         let tile_count = setup.camera.width.div_ceil(width) * setup.camera.height.div_ceil(height);
         assert!(all.iter().all(|&(tile, _)| tile < tile_count), "a slot is padding");
         assert_eq!(all.iter().collect::<HashSet<_>>().len(), all.len(), "one is a duplicate");
+    }
+}
+
+#[test]
+fn both_sorts_give_the_same_bits() {
+    for segment in [None, Some(64)] {
+        let [whole, tiles] = [Sorting::Whole, Sorting::Tiles].map(|sorting| {
+            let mut setup = needles(3000);
+            setup.settings.sorting = Some(sorting);
+            setup.segment = segment;
+            let mut rendered = setup.render();
+            let d_render: Vec<f32> = rendered.render.iter().map(|value| value - 0.5).collect();
+            let gradients = rendered.backward(&d_render);
+            (rendered.render.clone(), rendered.transmittances.clone(), gradients)
+        });
+        assert!(whole == tiles, "{segment:?}");
     }
 }
 

@@ -3,8 +3,9 @@
 use nightsplat::gpu::testing::{gpu, gpu_with};
 use nightsplat::gpu::{Buffer, Gpu, Threads};
 use nightsplat::kernels::digit::MAX_DIGITS;
+use nightsplat::kernels::no_tile::NO_TILE;
 use nightsplat::kernels::{scan_downsweep, scan_upsweep, sort_downsweep, sort_upsweep};
-use nightsplat::splats::sort::{Count, RadixSort, Scan};
+use nightsplat::splats::sort::{Count, RadixSort, Scan, TileSort, UnsortedTiles};
 
 const PARTITION: u32 = 1024;
 const SIZES: [u32; 8] =
@@ -334,5 +335,101 @@ fn compare_sort_kernels(rank_by_ballot: bool, subgroups: u32) {
             [table, digit_begins, sorted_keys, sorted_values, arrivals]
         );
         assert!(sorted_keys.is_sorted_by_key(|key| key >> 5 & 0x3fff), "{size} keys");
+    }
+}
+
+// ---------------------------------------------------------------------------
+// Tiles
+
+/// Intersections of tiles of these sizes, by slot in no order, and the depths of their Gaussians; `padding` slots belong
+/// to no tile.
+struct Intersections {
+    tiles: Vec<u32>,
+    places: Vec<u32>,
+    gaussian_ids: Vec<u32>,
+    depth_keys: Vec<u32>,
+}
+
+impl Intersections {
+    /// `depths`: how many different ones there are.
+    fn new(sizes: &[u32], padding: usize, depths: u32) -> Self {
+        let tiles = (0..).zip(sizes).flat_map(|(tile, &size)| vec![tile; size as usize]);
+        let mut tiles: Vec<u32> = tiles.chain(vec![NO_TILE; padding]).collect();
+        let draws = noise(2 * tiles.len() as u32 + 1);
+        for i in (1..tiles.len()).rev() {
+            tiles.swap(i, draws[i] as usize % (i + 1));
+        }
+        // Arrival from the last slot to the first.
+        let (mut arrived, mut places) = (vec![0; sizes.len()], vec![7; tiles.len()]);
+        for slot in (0..tiles.len()).rev() {
+            if let Some(arrived) = arrived.get_mut(tiles[slot] as usize) {
+                places[slot] = *arrived;
+                *arrived += 1;
+            }
+        }
+        let gaussian_ids = (0..tiles.len() as u32).rev().collect();
+        let depth_keys = draws[tiles.len()..].iter().map(|draw| draw % depths).collect();
+        Self { tiles, places, gaussian_ids, depth_keys }
+    }
+
+    /// The slots of all tiles, each by depth and then by slot, with their tiles.
+    fn sorted(&self) -> (Vec<u32>, Vec<u32>) {
+        let mut slots: Vec<u32> = (0..self.tiles.len() as u32).collect();
+        slots.retain(|&slot| self.tiles[slot as usize] != NO_TILE);
+        let depth = |slot: u32| self.depth_keys[self.gaussian_ids[slot as usize] as usize];
+        slots.sort_by_key(|&slot| (self.tiles[slot as usize], depth(slot), slot));
+        let tiles = slots.iter().map(|&slot| self.tiles[slot as usize]).collect();
+        (tiles, slots)
+    }
+}
+
+/// Sorts on the device with every pass checked, and compares with the standard library.
+fn assert_sorts_tiles(gpu: &Gpu, sort: &mut TileSort, what: &str, sizes: &[u32], depths: u32) {
+    let given = Intersections::new(sizes, 5, depths);
+    let counts = gpu.buffer("counts", &[given.tiles.len() as u32]).unwrap();
+    let [gaussian_ids, depth_keys, mut tiles, mut intersection_ids] =
+        [&given.gaussian_ids, &given.depth_keys, &given.tiles, &given.places]
+            .map(|values| gpu.buffer("intersections", values).unwrap());
+    sort.reserve_tiles(sizes.len()).unwrap();
+    gpu.write(&mut sort.sizes, sizes).unwrap();
+    let (done, report) = gpu.checked(|| {
+        gpu.run("tiles", |pass| {
+            let unsorted = UnsortedTiles {
+                counts: &counts,
+                gaussian_ids: &gaussian_ids,
+                depth_keys: &depth_keys,
+                tiles: &mut tiles,
+                intersection_ids: &mut intersection_ids,
+            };
+            sort.record(pass, sizes.len() as u32, unsorted)
+        })
+    });
+    done.unwrap();
+    report.agree().unwrap();
+    let what = format!("{what}, tiles of {sizes:?}");
+    let (expected_tiles, expected_slots) = given.sorted();
+    let (sorted_tiles, slots) = (gpu.read(&tiles).unwrap(), gpu.read(&intersection_ids).unwrap());
+    let count = expected_tiles.len();
+    assert_same(&what, &sorted_tiles[..count], &expected_tiles);
+    assert_same(&what, &slots[..count], &expected_slots);
+    assert!(sorted_tiles[count..].iter().all(|&tile| tile == NO_TILE), "{what}: padding");
+    assert!(gpu.read(&sort.sizes).unwrap().iter().all(|&size| size == 0), "{what}: sizes");
+}
+
+#[test]
+fn tiles_of_any_size_are_sorted_by_depth_and_then_by_slot() {
+    let gpu = gpu();
+    for (subgroups, capacity) in [(1, 64), (2, 64), (4, 256)] {
+        let mut sort = TileSort::with_capacity(&gpu, subgroups, capacity).unwrap();
+        let what = format!("{subgroups} subgroups, {capacity} pairs");
+        let at_limits = [0, 1, 2, capacity - 1, capacity, capacity + 1, 3, 0];
+        let beyond = [5, 2 * capacity, 2 * capacity + 1, 5 * capacity - 3, 8 * capacity];
+        for depths in [u32::MAX, 3, 1] {
+            assert_sorts_tiles(&gpu, &mut sort, &what, &at_limits, depths);
+            assert_sorts_tiles(&gpu, &mut sort, &what, &beyond, depths);
+        }
+        let small: Vec<u32> = (0..70).collect();
+        assert_sorts_tiles(&gpu, &mut sort, &what, &small, 40);
+        assert_sorts_tiles(&gpu, &mut sort, &what, &[], 1);
     }
 }

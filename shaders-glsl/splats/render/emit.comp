@@ -2,13 +2,16 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 #include "partition.glsl"
+#include "no_tile.glsl"
 #include "splat.glsl"
 #include "shared_intersections.glsl"
 
-//! Emit: one lane per depth rank writes the tiles of its Gaussian into the slots reserved for it.
+//! Emit: one lane per rank writes the tiles of its Gaussian into the slots reserved for it.
 //!
-//! Slots are in depth order, so a stable sort by tile leaves every tile's intersections front to back. A Gaussian's
-//! slots are contiguous: the backward pass sums over them. The lanes share those of a Gaussian that has many.
+//! Where ranks and so slots are in the order of depth, a stable sort by tile leaves every tile's intersections front to
+//! back. Where each tile is sorted by itself, ranks are in the order of the Gaussians, and every slot gets a place in its
+//! tile in the order of arrival. A Gaussian's slots are contiguous: the backward pass sums over them. The lanes share
+//! those of a Gaussian that has many.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -22,19 +25,22 @@ layout(binding = 2) readonly  buffer Before  { uint intersection_offsets[]; };  
 layout(binding = 3) readonly  buffer Sums    { uint sums[]; };          // what precedes each partition of ranks
 layout(binding = 4) readonly  buffer Splats  { ProjectedSplat splats[]; };
 layout(binding = 5) writeonly buffer Tiles   { uint tiles[]; };        // tile of each slot
-layout(binding = 6) writeonly buffer IntersectionIds   { uint intersection_ids[]; };        // 0, 1, 2, ...
+layout(binding = 6) writeonly buffer IntersectionIds   { uint intersection_ids[]; };  // the slot, or its place
 layout(binding = 7) writeonly buffer GaussianIds  { uint gaussian_ids[]; };       // of each intersection
 // first intersection of each Gaussian, one past the last
 layout(binding = 8) writeonly buffer IntersectionRanges { uvec2 intersection_ranges[]; };
 layout(binding = 9) readonly  buffer TileCounts { uint tile_counts[]; };  // by Gaussian
+layout(binding = 10)          buffer TileSizes  { uint tile_sizes[]; };   // intersections of each tile, zeros before
 
-const uint NO_TILE = 0xffffffffu;
+layout(constant_id = 5) const bool SORTS_TILES = false;  // each tile is sorted by itself
+
 // The tiles of a row that a lane writes in one turn.
 const uint TILES_PER_TURN = 2;
 
 void write_slot(uint slot, uint tile, uint id) {
     tiles[slot] = tile;
-    intersection_ids[slot] = slot;
+    bool is_placed = SORTS_TILES && tile != NO_TILE;
+    intersection_ids[slot] = is_placed ? atomicAdd(tile_sizes[tile], 1) : slot;
     gaussian_ids[slot] = id;
 }
 

@@ -89,6 +89,8 @@ pub struct RenderBuffers {
     pub status: Buffer<u32>,
     /// Workgroups of `order_counts` that are done; 0 between renders.
     pub arrivals: Buffer<u32>,
+    /// Bound where tiles are not counted.
+    pub(super) no_sizes: Buffer<u32>,
 }
 
 impl RenderBuffers {
@@ -124,6 +126,7 @@ impl RenderBuffers {
             counts: gpu.zeros("counts", 1)?,
             status: gpu.zeros("status", STATUS_WORDS as usize)?,
             arrivals: gpu.zeros("arrivals", 1)?,
+            no_sizes: gpu.zeros("tile_sizes", 1)?,
         })
     }
 

@@ -7,9 +7,9 @@ use nightsplat_core::camera::CameraModel;
 use super::buffers::{RANKS_PER_PARTITION, RenderBuffers, Segments};
 use super::lamp::DeviceLamp;
 use super::limits::{longest_run, segment_length, splats_per_turn};
-use super::{Purpose, RenderSettings, Renderer};
+use super::{Purpose, RenderSettings, Renderer, Sort};
 use crate::Result;
-use crate::gpu::{Gpu, Pipeline, Tile};
+use crate::gpu::{Gpu, Pipeline, Sorting, Tile};
 use crate::kernels::{
     blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
@@ -18,7 +18,7 @@ use crate::splats::camera::model_number;
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::Shape;
-use crate::splats::sort::RadixSort;
+use crate::splats::sort::{RadixSort, TileSort};
 
 impl Renderer {
     /// Builds the kernels; [`Renderer::reserve`] allocates.
@@ -85,8 +85,14 @@ impl Renderer {
         };
         let state = tile_width * tile_height * (channels + 1);
         let segments = Segments { length: segment, state };
-        let depth_sort = RadixSort::new(gpu, 0)?;
-        let tile_sort = depth_sort.another()?;
+        let sorting = settings.sorting_on(gpu);
+        let sort = match sorting {
+            Sorting::Whole => {
+                let by_depth = RadixSort::new(gpu, 0)?;
+                Sort::Whole { by_tile: by_depth.another()?, by_depth }
+            }
+            Sorting::Tiles => Sort::Tiles(TileSort::new(gpu)?),
+        };
         Ok(Self {
             gpu: gpu.clone(),
             settings,
@@ -101,12 +107,12 @@ impl Renderer {
                 tile_width,
                 tile_height,
                 partition_size,
+                sorts_tiles: sorting == Sorting::Tiles,
             })?,
             blend_forward: blending(gpu, &settings, tile, segment, false)?,
             blend_depths: None,
             blend_backward,
-            depth_sort,
-            tile_sort,
+            sort,
             frame: RenderBuffers::new(gpu, settings.channels(), settings.purpose, segments)?,
             limits: gpu.uninit("limits", 1)?,
             host_targets: None,

@@ -2,7 +2,7 @@
 
 use nightsplat_core::curves::SceneLaw;
 
-use crate::gpu::{Gpu, Properties, Tile};
+use crate::gpu::{Gpu, Properties, Sorting, Tile};
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{Features, Shape};
@@ -39,6 +39,9 @@ pub struct RenderSettings {
     pub tile: Option<Tile>,
     /// The most pixels that are rendered at once; `None`: as many as the device can bind.
     pub patch_pixels: Option<u64>,
+    /// How intersections are sorted; `None`: as is faster on the device. To show, always as a whole.
+    #[doc(hidden)]
+    pub sorting: Option<Sorting>,
 }
 
 /// What a renderer is for.
@@ -65,6 +68,7 @@ impl Default for RenderSettings {
             purpose: Purpose::Train,
             tile: None,
             patch_pixels: None,
+            sorting: None,
         }
     }
 }
@@ -113,7 +117,8 @@ impl RenderSettings {
             0..=TILE_CHANNELS => CPU_TILE.into(),
             _ => CPU_SMALL_TILE.into(),
         };
-        let tile = self.tile.or_else(|| gpu.tuned_tile(self.channels())).unwrap_or(built_in);
+        let tuned = || gpu.tuned_tile(self.channels()).map(|tuned| tuned.tile);
+        let tile = self.tile.or_else(tuned).unwrap_or(built_in);
         if gpu.properties().suits_tile(tile) {
             return Ok(tile);
         }
@@ -125,6 +130,16 @@ impl RenderSettings {
         let remedy = format!("1 to 32 times {lanes} pixels{of}; without `tile` the device chooses");
         let problem = format!("{tile} tiles do not suit {lanes} lanes");
         Err(Error::Usage(format!("{problem}; take a tile of {remedy}")))
+    }
+
+    /// The sort on this device: that of these settings, else the one that was measured to be faster. A draw without
+    /// gradients may leave out the farthest intersections of the whole view.
+    pub(super) fn sorting_on(&self, gpu: &Gpu) -> Sorting {
+        let tuned = || Some(gpu.tuned_tile(self.channels())?.sorting);
+        match self.purpose {
+            Purpose::Show => Sorting::Whole,
+            Purpose::Train => self.sorting.or_else(tuned).unwrap_or_default(),
+        }
     }
 
     /// Values per pixel of a render: RGB and the features.
