@@ -98,6 +98,8 @@ pub struct Properties {
     pub name: String,
     /// The driver's name and version, as the driver gives them.
     pub driver: String,
+    /// The PCI number of the vendor, or one that Khronos assigned.
+    pub vendor: u32,
     /// Bytes of device-local memory.
     pub memory: u64,
     /// Lanes of a subgroup in the kernels.

@@ -34,10 +34,18 @@ struct ProjectedSplat {
     float opacity;      // after the sigmoid
 };
 
-// The exponent of the Gaussian, -sigma, along a column of pixels that is `x` from its mean: the coefficients of a
-// polynomial in y. alpha = opacity exp(-sigma), sigma = (conic.x x x + conic.z y y) / 2 + conic.y x y.
-vec3 exponent_in_column(vec3 conic, float x) {
-    precise vec3 by_power = vec3(-0.5 * conic.x * x * x, -conic.y * x, -0.5 * conic.z);
+// The exponent of alpha to base 2 before its cap, log2(opacity) - sigma log2(e), where sigma = (conic.x x x + conic.z y
+// y) / 2 + conic.y x y: the coefficients of its quadratic form.
+vec3 exponent_form(vec3 conic) {
+    const float LOG2_E = 1.44269504;
+    precise vec3 form = vec3(-0.5, -1.0, -0.5) * LOG2_E * conic;
+    return form;
+}
+
+// The exponent along a column of pixels that is `x` from the mean: the coefficients of a polynomial in y. `peak` is the
+// exponent at the mean.
+vec3 exponent_in_column(vec3 form, float peak, float x) {
+    precise vec3 by_power = vec3(fma(form.x * x, x, peak), form.y * x, form.z);
     return by_power;
 }
 
@@ -45,6 +53,21 @@ vec3 exponent_in_column(vec3 conic, float x) {
 float exponent_at(vec3 by_power, float y) {
     precise float exponent = fma(fma(by_power.z, y, by_power.y), y, by_power.x);
     return exponent;
+}
+
+// The alpha that is blended: zero above the peak, as rounding puts it, below ALPHA_MIN and where anything is NaN. A
+// choice between computed values: the lanes never part.
+float visible_alpha(float exponent, float peak, float free_alpha) {
+    const float LEAST_EXPONENT = -7.99435344;  // log2(ALPHA_MIN)
+    float alpha = min(ALPHA_MAX, free_alpha);
+    bool counts = all(bvec2(exponent <= peak, exponent >= LEAST_EXPONENT));
+    return counts ? alpha : 0.0;
+}
+
+// The transmittance behind a splat. Both passes round it alike, and so end a pixel at the same splat.
+float transmittance_after(float before, float alpha) {
+    precise float after = fma(-alpha, before, before);
+    return after;
 }
 
 // Twice the sigma at which alpha falls to 1/255, slightly enlarged so that rounding never loses a pixel.
@@ -75,23 +98,6 @@ ivec2 splat_columns(ProjectedSplat splat, float top, float bottom) {
     left = clamp(left, -1e6, 1e6);
     right = clamp(right, -1e6, 1e6);
     return ivec2(int(ceil(left - 0.5)), int(floor(right - 0.5)));
-}
-
-// The shear, the half width at the height of the mean, and 1 / half_extent.y, for `splat_columns_of_row`.
-vec3 splat_outline(ProjectedSplat splat) {
-    float width = sqrt(splat_level(splat.opacity) / splat.conic.x);
-    return vec3(-splat.conic.y / splat.conic.x, width, 1.0 / splat.half_extent.y);
-}
-
-// `splat_columns` of one row of pixels, as numbers; what all rows have in common is in `outline`.
-vec2 splat_columns_of_row(ProjectedSplat splat, vec3 outline, float row) {
-    float y = row + 0.5 - splat.mean2d.y;
-    float height = y * outline.z;
-    float half_width = outline.y * sqrt(max(0.0, 1.0 - height * height)) + 0.01;
-    // Of no width where the row misses the ellipse.
-    half_width = abs(y) <= splat.half_extent.y ? half_width : -1.0;
-    float centre = splat.mean2d.x + outline.x * y - 0.5;
-    return vec2(ceil(centre - half_width), floor(centre + half_width));
 }
 
 // The tile columns [x, y) that the splat intersects in a row of tiles of an image `width` pixels wide.

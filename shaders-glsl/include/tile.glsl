@@ -40,28 +40,45 @@ uvec2 group_offset(uint group) {
     return uvec2(group * SUBGROUP_SIZE % TILE_WIDTH, group * SUBGROUP_SIZE / TILE_WIDTH);
 }
 
-// Whether a group has whole rows of pixels, and any of a row's columns is in it. A function, as `tile_is_shared`.
-bool has_whole_rows() {
-    uint width = TILE_WIDTH;
-    return SUBGROUP_SIZE % width == 0;
+// The rows of the part at `origin` between the highest and the lowest pixel that the splat's ellipse may meet in the
+// columns [first, last] of the part; empty if y < x. No term cancels: the half height at x is sqrt(level / conic.zz)
+// sqrt(1 - (x / half_extent.x)^2) about the shear line -conic.xy / conic.zz x.
+//
+// A row is left out for a proof alone: all rows are met where the box is not a number, or larger than the margin of the
+// roundings allows, and what is not a number ends no range. Choices are between names, both computed.
+ivec2 splat_rows(ProjectedSplat splat, uvec2 origin, uint first, uint last) {
+    vec2 mean = splat.mean2d - (vec2(origin) + 0.5);
+    vec2 extent = splat.half_extent;
+    float left = max(float(first) - mean.x, -extent.x);
+    float right = min(float(last) - mean.x, extent.x);
+    float lowest = -splat.conic.y / splat.conic.x * extent.y;  // x of the lowest point
+    vec2 x = clamp(vec2(-lowest, lowest), left, right);
+    vec2 share = x / extent.x;
+    vec2 height = sqrt(splat_level(splat.opacity) / splat.conic.z * max(vec2(0.0), 1.0 - share * share)) + 0.01;
+    vec2 middle = mean.y - splat.conic.y / splat.conic.z * x;
+    float top = ceil(middle.x - height.x), bottom = floor(middle.y + height.y), end = float(PART_HEIGHT - 1);
+    bool is_within = all(bvec4(greaterThan(extent, vec2(0.0)), lessThan(extent, vec2(1e4))));
+    bool is_beside = is_within && any(bvec3(left > right, top > end, bottom < 0.0));
+    top = is_within && top > 0.0 ? top : 0.0;
+    bottom = is_within && bottom < end ? bottom : end;
+    ivec2 rows = ivec2(top, bottom);
+    return is_beside ? ivec2(0, -1) : rows;
 }
 
-// The groups of pixels, one bit each, that the splat's ellipse intersects in the part at `origin`. In all others its
+// The groups of pixels, one bit each, that the splat's ellipse may meet in the part at `origin`. In all others its
 // alpha is below 1/255: skipping them changes only the time.
 uint splat_groups(ProjectedSplat splat, uvec2 origin) {
+    const uint WIDTH = TILE_WIDTH / COLUMNS;  // columns of pixels of a group
     uint groups = 0;
-    vec3 outline = splat_outline(splat);
-    for (uint row = 0; row < PART_HEIGHT; row++) {
-        vec2 columns = splat_columns_of_row(splat, outline, float(origin.y + row)) - float(origin.x);
-        columns = vec2(max(columns.x, 0.0), min(columns.y, float(TILE_WIDTH - 1)));
-        uint first = row * TILE_WIDTH, last = first;
-        if (!has_whole_rows()) {
-            first += uint(min(columns.x, float(TILE_WIDTH - 1)));
-            last += uint(max(columns.y, 0.0));
-        }
-        // Bits first..last; the shift past bit 31 wraps to zero as intended.
-        uint covered = (2u << last / SUBGROUP_SIZE) - (1u << first / SUBGROUP_SIZE);
-        groups |= columns.x <= columns.y ? covered : 0;
+    [[unroll]] for (uint k = 0; k < COLUMNS; k++) {
+        ivec2 rows = splat_rows(splat, origin, k * WIDTH, (k + 1) * WIDTH - 1);
+        uint in_columns = 0;
+        [[unroll]] for (uint row = 0; row < GROUPS / COLUMNS; row++) in_columns |= 1u << (row * COLUMNS + k);
+        // Bits of the first to those of the last row; the shift past bit 31 wraps to zero as intended.
+        uint first = uint(rows.x) * TILE_WIDTH / SUBGROUP_SIZE;
+        uint last = uint(max(rows.y, 0)) * TILE_WIDTH / SUBGROUP_SIZE + COLUMNS - 1;
+        uint in_rows = (2u << last) - (1u << first);
+        groups |= rows.x <= rows.y ? in_rows & in_columns : 0;
     }
     return SKIPS_GROUPS ? groups : ~0u;
 }

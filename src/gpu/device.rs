@@ -344,6 +344,7 @@ fn properties(
     Ok(Properties {
         name: supported.device_name(),
         driver,
+        vendor: supported.properties.vendor_id,
         memory: device_memory(instance, physical),
         subgroup_size: supported.lanes()?,
         subgroup_size_is_selectable: supported.subgroups.are_selectable,

@@ -205,6 +205,7 @@ impl Properties {
         Self {
             name: "Abacus 3000".to_owned(),
             driver: "beads 1.0".to_owned(),
+            vendor: 0,
             memory: 0,
             subgroup_size: 8,
             subgroup_size_is_selectable: true,

@@ -9,14 +9,13 @@ use nightsplat::gpu::testing::{gpu, gpu_with};
 use nightsplat::gpu::{Threads, Tile};
 use nightsplat::kernels::no_tile::NO_TILE;
 use nightsplat::kernels::status::STATUS_TILE_LIMIT;
-use nightsplat::kernels::{
-    self, ProjectedSplat, blend_forward, emit, order_counts, project_backward,
-};
+use nightsplat::kernels::{self, ProjectedSplat, emit, order_counts, project_backward};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::render::{RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::Shape;
 use nightsplat_core::camera::Patch;
 
+use crate::blending::tile_runs;
 use crate::common::setup::{Setup, features};
 use crate::common::{Random, not_run};
 
@@ -113,59 +112,6 @@ fn memory_for_intersections_grows_to_the_largest_binding_and_no_further() {
     renderer.grow(most).unwrap();
     let message = renderer.grow(most + 1).unwrap_err().to_string();
     assert!(message.contains("gradient_records"), "{message}");
-}
-
-/// The runs of `sorted_tiles` that `blend_forward` finds in a view of 5 x 24 tiles, and the status.
-fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>, Vec<u32>) {
-    let setup = Setup::new(1, [32, 32], 0, 1);
-    let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
-    let (count, size) = (sorted_tiles.len() as u32, UVec2::new(5 * 16, 24 * 16));
-    let (counts, sorted_intersections, gaussian_ids) =
-        (vec![count], (0..count).collect::<Vec<_>>(), vec![0; count as usize]);
-    let (colors, pixels) = (vec![0.5; 4], size.element_product() as usize);
-    let (render, transmittances) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
-    let (tile_ranges, status, limits) = (vec![UVec2::ONE; 120], vec![0; 3], vec![0.0f32]);
-    let params = blend_forward::Params {
-        size,
-        tile_columns: 5,
-        longest_run,
-        has_limits: 0,
-        takes_median: 0,
-        background: [0.0; 11],
-    };
-    let segment_states = vec![0.0f32];
-    let (_, _, ranges, status, _) = run_kernel!(
-        blend_forward,
-        blend_forward::Constants::default(),
-        params,
-        Threads::Workgroups([120, 1, 1]),
-        [counts, sorted_intersections, gaussian_ids, splats, colors, sorted_tiles, limits],
-        [render, transmittances, tile_ranges, status, segment_states]
-    );
-    (ranges, status)
-}
-
-#[test]
-fn padding_belongs_to_no_tile() {
-    let (ranges, status) = tile_runs(vec![0, 0, 2, 120, u32::MAX], 2);
-    assert_eq!(ranges[..3], [UVec2::new(0, 2), UVec2::splat(2), UVec2::new(2, 3)]);
-    assert!(ranges[3..].iter().all(|range| range.x == range.y));
-    assert_eq!(status, [0; 3]);
-}
-
-#[test]
-fn every_tile_finds_its_run_among_any_number_of_intersections() {
-    let mut random = Random::new(8);
-    for count in [0, 1, 7, 8, 9, 63, 64, 65, 513, 5000] {
-        let mut tiles: Vec<u32> = (0..count).map(|_| random.between(0.0, 122.0) as u32).collect();
-        tiles.sort_unstable();
-        let (ranges, _) = tile_runs(tiles.clone(), u32::MAX);
-        for (tile, range) in (0..120).zip(ranges) {
-            let run = &tiles[range.x as usize..range.y as usize];
-            let all = tiles.iter().filter(|&&other| other == tile).count();
-            assert!(run.len() == all && run.iter().all(|&other| other == tile), "{count}: {tile}");
-        }
-    }
 }
 
 #[test]

@@ -8,6 +8,7 @@ mod common;
 
 mod antialiasing;
 mod batches;
+mod blending;
 mod checked;
 mod conditioning;
 mod context;

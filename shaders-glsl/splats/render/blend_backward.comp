@@ -1,20 +1,21 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_subgroup_uniform_control_flow : require
+#extension GL_KHR_memory_scope_semantics : require
 #include "kernel.glsl"
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "splat.glsl"
 #include "tile.glsl"
-#include "record_sums.glsl"
 #include "segments.glsl"
 
 //! Blend backward: a tile's subgroups, most often one, write the gradient record of every intersection to its slot.
 //!
 //! Walks front to back again, as the forward pass did, with the light still to come, L_i = sum_{k >= i} c_k alpha_k
-//! T_k + T background, which starts as the render itself: dC / dalpha_i = (c_i T_i - L_i) / (1 - alpha_i). Of both,
-//! the product with dL/dC is all that is needed: one number a pixel, however many channels. The gradients of the
-//! ellipse are multiples of moments, sums of dL/dsigma times powers of the offset. No atomics: a slot is written by the
-//! one tile it belongs to, and the sums over a tile's parts and over a Gaussian's slots come in a fixed order.
+//! T_k + T background, which starts as the render itself: -alpha_i dC / dalpha_i = alpha_i / (1 - alpha_i) L_(i + 1) -
+//! c_i alpha_i T_i. Of both terms, the product with dL/dC is all that is needed: one number a pixel, however many
+//! channels. The gradients of the ellipse are multiples of moments, sums of dL/dsigma times powers of the offset. No
+//! atomics: a slot is written by the one tile it belongs to, and the sums over a tile's lanes and parts and over a
+//! Gaussian's slots come in a fixed order.
 //!
 //! Where long runs have segments, the first workgroups have the first segment of every tile, the others one for each
 //! block of intersections, and with it at most one further segment.
@@ -37,11 +38,12 @@ layout(binding = 8) readonly  buffer Counts  { uint counts[]; };  // [0]: inters
 layout(binding = 9) readonly  buffer Tiles   { uint sorted_tiles[]; };
 layout(binding = 10) readonly buffer SegmentStates { float segment_states[]; };  // include/segments.glsl
 
-// The splats that a subgroup loads at once: one a lane; at most 32 where parts add their records in shared memory.
-const uint BATCH = SUBGROUP_SIZE / (1 + (1 - 1 / SUBGROUPS_PER_TILE) * ((SUBGROUP_SIZE - 1) / 32));
+#include "batch.glsl"
+#include "record_sums.glsl"
+
 const uint RECORD_FLOATS = 4 * RECORD_VECTORS;
-// (parts, BATCH, RECORD_FLOATS): the records of a batch; without use where a tile has one part.
-shared float shares[(SUBGROUPS_PER_TILE - 1 / SUBGROUPS_PER_TILE) * BATCH * RECORD_FLOATS + 1];
+// (parts, BATCH, RECORD): the records of a batch; without use where a tile has one part.
+shared float shares[(SUBGROUPS_PER_TILE - 1 / SUBGROUPS_PER_TILE) * BATCH * RECORD + 1];
 shared uint are_alive[SUBGROUPS_PER_TILE];
 
 // Whether the gradients of a splat's colours are summed over the groups when these are done, from their weights: narrow
@@ -60,6 +62,39 @@ bool tile_any(bool says) {
         for (uint part = 0; part < SUBGROUPS_PER_TILE; part++) any = any || are_alive[part] != 0;
     }
     return any;
+}
+
+// The values of a record that a part stores: parts do not share what fills up the last vector.
+uint stored_values() { return tile_is_shared() ? RECORD : RECORD_FLOATS; }
+
+// A value of the sum of a record over the part.
+void store_sum(uint slot, uint value, float sum) {
+    if (tile_is_shared()) shares[(gl_SubgroupID * BATCH + slot) * RECORD + value] = sum;
+    else gradient_records[RECORD_VECTORS * slot + value / 4][value % 4] = sum;
+}
+
+// The record of a splat that misses the part, by one lane.
+void store_no_record(uint slot) {
+    if (tile_is_shared()) {
+        for (uint value = 0; value < RECORD; value++) store_sum(slot, value, 0.0);
+    } else {
+        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) gradient_records[RECORD_VECTORS * slot + k] = vec4(0.0);
+    }
+}
+
+// Stores the sums of `count` rows of records in shared memory, those of the splats of the batch from `first` on.
+void store_row_sums(uint first, uint count) {
+    order_shared_memory();
+    uint lane = gl_SubgroupInvocationID;
+    [[unroll]] for (uint i = 0; i < ROWS * RECORD; i += SUBGROUP_SIZE) {
+        uint row = (i + lane) / RECORD, value = (i + lane) % RECORD;
+        if (row < count) store_sum(staged_slot(first + row), value, row_sum(i + lane));
+    }
+    // What fills up the last vector, so that memory is written whole.
+    uint row = lane / 4, value = RECORD_FLOATS - 4 + lane % 4;
+    uint filled = tile_is_shared() ? 0 : count;
+    if (row < filled && value >= RECORD) store_sum(staged_slot(first + row), value, 0.0);
+    order_shared_memory();
 }
 
 // The tile of this workgroup and its intersections; none where the block has no start of a segment.
@@ -90,8 +125,9 @@ void main() [[subgroup_uniform_control_flow]] {
     uvec2 origin = tile_origin(tile, tile_columns);
     origin.y += gl_SubgroupID * PART_HEIGHT;
     uvec2 first_pixel = origin + lane_pixel();
+    vec2 first_center = vec2(first_pixel) + 0.5;
 
-    float transmittance[GROUPS];    // zero once the pixel is done
+    float transmittance[GROUPS];    // below TRANSMITTANCE_MIN once the pixel is done: it only falls
     float light[GROUPS];            // still to come, times d_pixel
     float d_pixel[GROUPS][CHANNELS];
     [[unroll]] for (uint g = 0; g < GROUPS; g++) {
@@ -122,113 +158,104 @@ void main() [[subgroup_uniform_control_flow]] {
     uint first = range.x;
     for (; first < range.y; first += BATCH) {
         bool alive = false;
-        [[unroll]] for (uint g = 0; g < GROUPS; g++) alive = alive || transmittance[g] > 0.0;
+        [[unroll]] for (uint g = 0; g < GROUPS; g++) alive = alive || transmittance[g] >= TRANSMITTANCE_MIN;
         if (!tile_any(alive)) break;
 
         uint batch = min(BATCH, range.y - first);
         uint slot = sorted_intersections[first + min(lane, batch - 1)];
-        uint id = gaussian_ids[slot];
-        ProjectedSplat mine = splats[id];
-        vec4 my_color[COLOR_VECTORS];
-        [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) my_color[k] = colors[COLOR_VECTORS * id + k];
-        uint my_groups = splat_groups(mine, origin);
-        if (lane >= batch) mine.opacity = 0.0;
+        bool is_in_batch = lane < batch;
+        PreparedSplat mine = prepared_splat(gaussian_ids[slot], tile_is_shared() ? lane : slot, is_in_batch, origin);
+        if (SKIPS_GROUPS && is_in_batch && mine.groups == 0) store_no_record(mine.slot);
+        uint waiting = stage(mine, batch);
 
+        uint rows = 0;  // records in shared memory whose sums are not stored
         // Tested at its end: a processor's driver runs a loop tested at its head once more, with every lane off.
-        for (uint turn = 0; true;) {
+        if (SKIPS_GROUPS ? waiting > 0 : true) for (uint turn = 0; true;) {
             [[unroll]] for (uint k = 0; k < SPLATS_PER_TURN; k++) {
                 uint j = turn + k;
-                uint groups = subgroupShuffle(my_groups, j);
+                if (SKIPS_GROUPS && k > 0 && j >= waiting) continue;
+                PreparedSplat splat = splat_of_batch(mine, j);
                 float record[RECORD_SPACE];
                 [[unroll]] for (uint i = 0; i < RECORD_SPACE; i++) record[i] = 0.0;
-                // What misses all of the part leaves nothing to sum.
-                if ((SKIPS_GROUPS ? groups : ~0u) != 0) {
-                    vec2 offset = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
-                    vec3 conic = subgroupShuffle(mine.conic, j);
-                    float opacity = subgroupShuffle(mine.opacity, j);
-                    float splat_color[CHANNELS];
-                    [[unroll]] for (uint c = 0; c < CHANNELS; c++)
-                        splat_color[c] = subgroupShuffle(my_color[c / 4][c % 4], j);
-                    vec3 exponents[COLUMNS];
-                    vec3 moments[COLUMNS];  // 1, y, yy
-                    [[unroll]] for (uint i = 0; i < COLUMNS; i++) {
-                        exponents[i] = exponent_in_column(conic, offset.x - float(group_offset(i).x));
-                        moments[i] = vec3(0.0);
-                    }
-
-                    float weights[GROUPS];
-                    // Choices are between names, both computed: a compiler makes branches of others.
-                    [[unroll]] for (uint g = 0; g < GROUPS; g++) {
-                        if ((groups >> g & 1) == 0) continue;
-                        float y = offset.y - float(group_offset(g).y);
-                        float exponent = exponent_at(exponents[g % COLUMNS], y);
-                        float free_alpha = opacity * exp(exponent);
-                        float alpha = min(ALPHA_MAX, free_alpha);
-                        bool counts = all(bvec2(exponent <= 0.0, alpha >= ALPHA_MIN));
-                        // What does not count has alpha 0: the lanes never part.
-                        alpha = counts ? alpha : 0.0;
-                        float before = transmittance[g];
-                        float after = before * (1.0 - alpha);
-                        bool is_done = after < TRANSMITTANCE_MIN;
-                        transmittance[g] = is_done ? 0.0 : after;
-                        float weight = alpha * before;
-                        weight = is_done ? 0.0 : weight;
-                        weights[g] = weight;
-                        float shade = 0.0;
-                        [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                            if (!sums_colors_last()) record[RECORD_HEAD + c] += weight * d_pixel[g][c];
-                            if (c < SHAPING_CHANNELS) shade += splat_color[c] * d_pixel[g][c];
-                        }
-                        // -alpha dL/dalpha; at the cap alpha no longer depends on the splat.
-                        float d_sigma = alpha * (light[g] - before * shade) / (1.0 - alpha);
-                        bool is_free = !any(bvec2(is_done, free_alpha > ALPHA_MAX));
-                        d_sigma = is_free ? d_sigma : 0.0;
-                        light[g] -= weight * shade;
-                        float d_sigma_y = d_sigma * y;
-                        moments[g % COLUMNS] += vec3(d_sigma, d_sigma_y, d_sigma_y * y);
-                    }
-                    [[unroll]] for (uint i = 0; i < COLUMNS; i++) {
-                        float x = offset.x - float(group_offset(i).x);
-                        float moment_x = x * moments[i].x;
-                        record[0] += moments[i].x;
-                        record[1] += moment_x;
-                        record[2] += moments[i].y;
-                        record[3] += x * moment_x;
-                        record[4] += x * moments[i].y;
-                        record[5] += moments[i].z;
-                    }
-                    [[unroll]] for (uint g = 0; g < GROUPS; g++) {
-                        if (!sums_colors_last() || (groups >> g & 1) == 0) continue;
-                        [[unroll]] for (uint c = 0; c < CHANNELS; c++)
-                            record[RECORD_HEAD + c] += weights[g] * d_pixel[g][c];
-                    }
-                    sum_record(record);
+                vec2 offset = splat.mean2d - first_center;
+                vec3 exponents[COLUMNS];
+                vec3 moments[COLUMNS];  // 1, y, yy
+                [[unroll]] for (uint i = 0; i < COLUMNS; i++) {
+                    exponents[i] = exponent_in_column(splat.form, splat.peak, offset.x - float(group_offset(i).x));
+                    moments[i] = vec3(0.0);
                 }
-                uint record_slot = subgroupShuffle(slot, j);
-                [[unroll]] for (uint i = 0; i < RECORD_FLOATS; i += SUBGROUP_SIZE) {
-                    uint value = i + lane;
-                    bool is_own = value < RECORD_FLOATS && j < batch;
-                    if (is_own && tile_is_shared())
-                        shares[(gl_SubgroupID * BATCH + j) * RECORD_FLOATS + value] = record[i / SUBGROUP_SIZE];
-                    else if (is_own)
-                        gradient_records[RECORD_VECTORS * record_slot + value / 4][value % 4] =
-                            record[i / SUBGROUP_SIZE];
+
+                float weights[GROUPS];
+                // Choices are between names, both computed: a compiler makes branches of others.
+                [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                    if ((splat.groups & 1u << g) == 0) continue;
+                    float y = offset.y - float(group_offset(g).y);
+                    float exponent = exponent_at(exponents[g % COLUMNS], y);
+                    float free_alpha = exp2(exponent);
+                    float alpha = visible_alpha(exponent, splat.peak, free_alpha);
+                    float weight = alpha * transmittance[g];
+                    transmittance[g] = transmittance_after(transmittance[g], alpha);
+                    bool is_done = transmittance[g] < TRANSMITTANCE_MIN;
+                    weight = is_done ? 0.0 : weight;
+                    weights[g] = weight;
+                    float shade = 0.0;
+                    [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
+                        if (!sums_colors_last()) record[RECORD_HEAD + c] += weight * d_pixel[g][c];
+                        if (c < SHAPING_CHANNELS) shade += splat.color[c / 4][c % 4] * d_pixel[g][c];
+                    }
+                    float passed = weight * shade;
+                    light[g] -= passed;
+                    // At the cap alpha no longer depends on the splat.
+                    bool is_held = any(bvec2(is_done, free_alpha > ALPHA_MAX));
+                    float d_sigma = alpha / (1.0 - alpha) * light[g] - passed;
+                    d_sigma = is_held ? 0.0 : d_sigma;
+                    float d_sigma_y = d_sigma * y;
+                    moments[g % COLUMNS] += vec3(d_sigma, d_sigma_y, d_sigma_y * y);
+                }
+                [[unroll]] for (uint i = 0; i < COLUMNS; i++) {
+                    float x = offset.x - float(group_offset(i).x);
+                    float moment_x = x * moments[i].x;
+                    record[0] += moments[i].x;
+                    record[1] += moment_x;
+                    record[2] += moments[i].y;
+                    record[3] += x * moment_x;
+                    record[4] += x * moments[i].y;
+                    record[5] += moments[i].z;
+                }
+                [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                    if (!sums_colors_last() || (splat.groups & 1u << g) == 0) continue;
+                    [[unroll]] for (uint c = 0; c < CHANNELS; c++)
+                        record[RECORD_HEAD + c] += weights[g] * d_pixel[g][c];
+                }
+                if (SUMS_IN_SHARED_MEMORY != 0) {
+                    put_row(rows++, record);
+                    if (rows == ROWS || j + 1 == waiting) {
+                        store_row_sums(j + 1 - rows, rows);
+                        rows = 0;
+                    }
+                } else {
+                    sum_record(record);
+                    [[unroll]] for (uint i = 0; i < RECORD_FLOATS; i += SUBGROUP_SIZE) {
+                        if (i + lane < stored_values() && j < waiting)
+                            store_sum(splat.slot, i + lane, record[i / SUBGROUP_SIZE]);
+                    }
                 }
             }
             turn += SPLATS_PER_TURN;
-            if (turn >= batch) break;
+            if (turn >= waiting) break;
         }
+        order_shared_memory();
         if (tile_is_shared()) {
             barrier();
             // The sums, in the order of the parts. Unrolled: some devices limit the iterations of an invocation.
             [[unroll]] for (uint k = 0; k < BATCH * RECORD_FLOATS; k += SUBGROUP_SIZE * SUBGROUPS_PER_TILE) {
                 uint i = k + gl_LocalInvocationIndex;
-                if (i < batch * RECORD_FLOATS) {
+                uint j = i / RECORD_FLOATS, value = i % RECORD_FLOATS;
+                if (j < batch) {
                     float sum = 0.0;
                     [[unroll]] for (uint part = 0; part < SUBGROUPS_PER_TILE; part++)
-                        sum += shares[part * BATCH * RECORD_FLOATS + i];
-                    uint value = i % RECORD_FLOATS;
-                    uint at = RECORD_VECTORS * sorted_intersections[first + i / RECORD_FLOATS] + value / 4;
+                        sum += value < RECORD ? shares[(part * BATCH + j) * RECORD + value] : 0.0;
+                    uint at = RECORD_VECTORS * sorted_intersections[first + j] + value / 4;
                     gradient_records[at][value % 4] = sum;
                 }
             }

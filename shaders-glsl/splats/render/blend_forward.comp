@@ -1,6 +1,7 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_subgroup_uniform_control_flow : require
+#extension GL_KHR_memory_scope_semantics : require
 #include "kernel.glsl"
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "splat.glsl"
@@ -11,9 +12,8 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //! Blend forward: a subgroup owns a tile or a part of one, finds the tile's run of the sorted intersections and
 //! composites it front to back.
 //!
-//! C = sum_i c_i alpha_i T_i + T background, T_i = prod_{j < i} (1 - alpha_j). Each lane loads one splat of a batch and
-//! finds the groups of pixels that its ellipse meets; the batch is then broadcast splat by splat. The tile's state
-//! stays in registers: no shared memory, no barrier.
+//! C = sum_i c_i alpha_i T_i + T background, T_i = prod_{j < i} (1 - alpha_j). The splats come in batches, each read by
+//! all lanes. The tile's state stays in registers.
 //!
 //! With VIEW_DEPTHS the last channel is the depth in the view: a splat beyond a pixel's limit ends it, as the order is
 //! front to back. The channel is the sum of the weighted depths, or the depth at which the transmittance passes 1/2.
@@ -45,6 +45,7 @@ layout(constant_id = 11) const uint VIEW_DEPTHS = 0;  // 1: the last channel is 
 const float NO_DEPTH = 3.4e38;
 
 #include "tile_run.glsl"
+#include "batch.glsl"
 
 // Subgroups that share a tile leave its loops each for itself.
 void main() [[subgroup_uniform_control_flow]] {
@@ -54,6 +55,7 @@ void main() [[subgroup_uniform_control_flow]] {
     if (origin.y >= size.y) return;
     origin.y += gl_SubgroupID * PART_HEIGHT;
     uvec2 first_pixel = origin + lane_pixel();
+    vec2 first_center = vec2(first_pixel) + 0.5;
 
     // Negative once the pixel is done; the magnitude is the transmittance.
     float transmittance[GROUPS];
@@ -73,7 +75,7 @@ void main() [[subgroup_uniform_control_flow]] {
     uvec2 range = tile_run(tile, longest_run);
     if (gl_SubgroupID == 0 && subgroupElect()) tile_ranges[tile] = range;
     uint first = range.x;
-    for (; first < range.y; first += SUBGROUP_SIZE) {
+    for (; first < range.y; first += BATCH) {
         bool alive = false;
         [[unroll]] for (uint g = 0; g < GROUPS; g++) alive = alive || transmittance[g] > 0.0;
         if (!subgroupAny(alive)) break;
@@ -87,55 +89,44 @@ void main() [[subgroup_uniform_control_flow]] {
             }
         }
 
-        uint batch = min(SUBGROUP_SIZE, range.y - first);
-        // Lanes beyond the batch load its last splat, which counts on no pixel without opacity.
+        uint batch = min(BATCH, range.y - first);
         uint id = gaussian_ids[sorted_intersections[first + min(lane, batch - 1)]];
-        ProjectedSplat mine = splats[id];
-        vec4 my_color[COLOR_VECTORS];
-        [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) my_color[k] = colors[COLOR_VECTORS * id + k];
-        uint my_groups = splat_groups(mine, origin);
-        if (lane >= batch) mine.opacity = 0.0;
+        PreparedSplat mine = prepared_splat(id, 0, lane < batch, origin);
+        uint waiting = stage(mine, batch);
 
         // Tested at its end: a processor's driver runs a loop tested at its head once more, with every lane off.
-        for (uint turn = 0; true;) {
+        if (SKIPS_GROUPS ? waiting > 0 : true) for (uint turn = 0; true;) {
             [[unroll]] for (uint k = 0; k < SPLATS_PER_TURN; k++) {
-                uint j = turn + k;
-                uint groups = subgroupShuffle(my_groups, j);
-                vec2 offset = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
-                vec3 conic = subgroupShuffle(mine.conic, j);
-                float opacity = subgroupShuffle(mine.opacity, j);
-                float splat_color[CHANNELS];
-                [[unroll]] for (uint c = 0; c < CHANNELS; c++)
-                    splat_color[c] = subgroupShuffle(my_color[c / 4][c % 4], j);
+                if (SKIPS_GROUPS && k > 0 && turn + k >= waiting) continue;
+                PreparedSplat splat = splat_of_batch(mine, turn + k);
+                vec2 offset = splat.mean2d - first_center;
                 vec3 exponents[COLUMNS];
-                [[unroll]] for (uint k = 0; k < COLUMNS; k++)
-                    exponents[k] = exponent_in_column(conic, offset.x - float(group_offset(k).x));
+                [[unroll]] for (uint i = 0; i < COLUMNS; i++)
+                    exponents[i] = exponent_in_column(splat.form, splat.peak, offset.x - float(group_offset(i).x));
 
                 // Choices are between names, both computed: a compiler makes branches of others.
                 [[unroll]] for (uint g = 0; g < GROUPS; g++) {
-                    if ((groups >> g & 1) == 0) continue;
+                    if ((splat.groups & 1u << g) == 0) continue;
                     float exponent = exponent_at(exponents[g % COLUMNS], offset.y - float(group_offset(g).y));
-                    float alpha = min(ALPHA_MAX, opacity * exp(exponent));
-                    bool counts = all(bvec2(exponent <= 0.0, alpha >= ALPHA_MIN));
-                    // What does not count is composited with alpha 0: the lanes never part.
-                    alpha = counts ? alpha : 0.0;
+                    float alpha = visible_alpha(exponent, splat.peak, exp2(exponent));
                     float before = transmittance[g];
-                    float after = before * (1.0 - alpha);
+                    float after = transmittance_after(before, alpha);
                     bool is_done = after < TRANSMITTANCE_MIN;
                     if (VIEW_DEPTHS != 0) {
-                        float depth = splat_color[CHANNELS - 1];
+                        float depth = splat.color[(CHANNELS - 1) / 4][(CHANNELS - 1) % 4];
                         is_done = is_done || depth > limit[g];
                         if (before > 0.5 && after <= 0.5 && !is_done) median[g] = depth;
                     }
                     float last = -abs(before), weight = alpha * before;
                     transmittance[g] = is_done ? last : after;
                     weight = is_done ? 0.0 : weight;
-                    [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] += weight * splat_color[c];
+                    [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] += weight * splat.color[c / 4][c % 4];
                 }
             }
             turn += SPLATS_PER_TURN;
-            if (turn >= batch) break;
+            if (turn >= waiting) break;
         }
+        order_shared_memory();
     }
 
     if (SEGMENT != 0) {

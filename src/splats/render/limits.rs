@@ -14,6 +14,16 @@ pub(super) fn splats_per_turn(gpu: &Gpu) -> u32 {
     if gpu.properties().max_loop_iterations < u32::MAX { 2 } else { 1 }
 }
 
+/// 1 where the backward pass sums gradient records over the lanes in shared memory, 0 where by shuffles.
+///
+/// A record of three channels takes 12 shuffles. On NVIDIA each is an instruction of the units for loads, and a lane that
+/// sums a value of its own takes a third fewer instructions. AMD and Intel read another lane's register within an
+/// addition, and on AMD the memory would leave room for a third of the subgroups. A CPU has its splats in registers.
+pub(super) fn sums_in_shared_memory(device: &Properties) -> u32 {
+    const NVIDIA: u32 = 0x10de;
+    u32::from(device.vendor == NVIDIA && !device.is_cpu)
+}
+
 /// The splats of a segment of a tile's run on a GPU, where the last splats of a long run would wait for all before them
 /// while the device has nothing else to do; shorter where subgroups share the tiles of small views. The states between
 /// segments take memory. A processor is busy with other tiles.
@@ -122,4 +132,19 @@ pub(super) fn longest_run(gpu: &Gpu) -> u32 {
     let lanes = properties.subgroup_size;
     let turns_per_batch = 1 + lanes.div_ceil(splats_per_turn(gpu));
     ((properties.max_loop_iterations - SOME_TURNS) / turns_per_batch).saturating_mul(lanes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn records_are_summed_in_shared_memory_on_nvidia_alone() {
+        for (vendor, is_cpu, expected) in
+            [(0x10de, false, 1), (0x1002, false, 0), (0x8086, false, 0), (0x10de, true, 0)]
+        {
+            let device = Properties { vendor, is_cpu, ..Properties::of_a_test() };
+            assert_eq!(sums_in_shared_memory(&device), expected, "{vendor:x} {is_cpu}");
+        }
+    }
 }

@@ -6,7 +6,7 @@ use nightsplat_core::camera::CameraModel;
 
 use super::buffers::{RANKS_PER_PARTITION, RenderBuffers, Segments};
 use super::lamp::DeviceLamp;
-use super::limits::{longest_run, segment_length, splats_per_turn};
+use super::limits::{longest_run, segment_length, splats_per_turn, sums_in_shared_memory};
 use super::{Purpose, RenderSettings, Renderer, Sort};
 use crate::Result;
 use crate::gpu::{Gpu, Pipeline, Sorting, Tile};
@@ -79,6 +79,7 @@ impl Renderer {
                 shaping_channels,
                 skips_groups,
                 splats_per_turn,
+                sums_in_shared_memory: sums_in_shared_memory(gpu.properties()),
                 subgroups_per_tile,
                 segment,
             })?),
