@@ -8,7 +8,6 @@
 
 mod adam;
 mod adam_gaussian;
-mod adam_rest;
 pub mod blend_backward;
 pub mod blend_forward;
 mod blending;

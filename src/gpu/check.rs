@@ -20,6 +20,15 @@ pub enum Tolerance {
     Roundings(f64),
     /// A bound for each number; numbers beyond the list are exact.
     Each(Vec<f64>),
+    /// A bound for each number, and after them for both numbers of each word, the lower first; then exact.
+    Packed {
+        /// Of the whole words.
+        numbers: Vec<f64>,
+        /// The value of half a word.
+        format: fn(u16) -> f64,
+        /// Of the halves of the words after them.
+        pairs: Vec<[f64; 2]>,
+    },
     /// Two 16-bit floats in a word, each equal to the reference's or adjacent to it.
     Halves,
     /// Four bytes in a word, each equal to the reference's or adjacent to it.
@@ -200,6 +209,15 @@ impl Versions<'_> {
                 comparison.add(i, device, reference, 1.0);
                 continue;
             }
+            if let Tolerance::Packed { numbers, format, pairs } = tolerance
+                && let Some(bounds) = i.checked_sub(numbers.len()).and_then(|at| pairs.get(at))
+            {
+                for (shift, bound) in [0, 16].into_iter().zip(bounds) {
+                    let half = |word: u32| format((word >> shift) as u16);
+                    comparison.add(i, half(self.device[i]), half(expected), *bound);
+                }
+                continue;
+            }
             let (device, reference) = (number(self.device[i]), number(expected));
             let bound = match tolerance {
                 Tolerance::Exact
@@ -208,7 +226,7 @@ impl Versions<'_> {
                 | Tolerance::Bytes
                 | Tolerance::AnyOrder { .. } => 0.0,
                 Tolerance::Roundings(n) => n * ROUNDING * reference.abs() + flushed(1),
-                Tolerance::Each(bounds) => bounds
+                Tolerance::Each(bounds) | Tolerance::Packed { numbers: bounds, .. } => bounds
                     .get(i)
                     .map_or(0.0, |bound| bound + if self.is_float { flushed(1) } else { 0.0 }),
             };
@@ -333,6 +351,23 @@ mod tests {
         assert!(compare(&[1.0 + one], &[1.0], &Tolerance::Roundings(1.0)).first.is_some());
         assert!(compare(&[1.0 + one], &[1.0], &Tolerance::Exact).first.is_some());
         assert_eq!(compare(&[0.0], &[-0.0], &Tolerance::Exact), BufferComparison::default());
+    }
+
+    #[test]
+    fn both_numbers_of_a_word_have_bounds_and_words_before_and_after_them_are_numbers() {
+        let packed = Tolerance::Packed {
+            numbers: vec![0.25],
+            format: |half| f64::from(half),
+            pairs: vec![[1.0, 0.0]],
+        };
+        let words = |pair: u32| [1.0, f32::from_bits(pair), 2.0];
+        let of = |device: [f32; 3]| compare(&device, &words(0x0005_0007), &packed);
+        assert_eq!(of(words(0x0005_0006)), BufferComparison { error: 1.0, ..Default::default() });
+        let off = |pair| of(words(pair)).first;
+        assert_eq!(off(0x0005_0009), Some((1, [9.0, 7.0, 1.0])));
+        assert_eq!(off(0x0004_0008), Some((1, [4.0, 5.0, 0.0])));
+        assert!(of([1.25, words(0x0005_0007)[1], 2.0]).first.is_none());
+        assert_eq!(of([1.0, words(0x0005_0007)[1], 2.5]).first, Some((2, [2.5, 2.0, 0.0])));
     }
 
     #[test]

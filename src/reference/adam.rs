@@ -1,6 +1,5 @@
 use nightsplat_photographs::tone::Real;
 
-use super::random::random_bits;
 use super::rounding::Rounded;
 use crate::gpu::Reference;
 use crate::kernels::adam::{Constants, Kernel, Params, Slices, Tolerances};
@@ -24,30 +23,9 @@ pub(super) fn stepped<T: Real>(
     [of(p) - of(rate) * m / divisor, m, v]
 }
 
-fn clamp_gradient(gradient: f32) -> f32 {
+pub(super) fn clamp_gradient(gradient: f32) -> f32 {
     let bound = GRADIENT_BOUND as f32;
     if gradient.is_finite() { gradient.clamp(-bound, bound) } else { 0.0 }
-}
-
-/// Both moments from a word.
-pub(super) fn from_halves(word: u32) -> [f32; 2] {
-    [word & 0xffff_0000, word << 16].map(f32::from_bits)
-}
-
-/// Both moments after the step as on the device, without fused multiply-adds, and the random number of their rounding.
-pub(super) fn moments_after(step: u32, [p, g, m, v]: [f32; 4]) -> ([f32; 2], u32) {
-    let g = clamp_gradient(g);
-    let m = BETA1 as f32 * m + (1.0 - BETA1) as f32 * g;
-    let v = BETA2 as f32 * v + (1.0 - BETA2) as f32 * g * g;
-    let [m, v] = [m, v].map(|x: f32| if x.is_subnormal() { 0.0 } else { x });
-    ([m, v], random_bits((p.to_bits() ^ v.to_bits()).wrapping_add(random_bits(step))))
-}
-
-/// Both moments in a word.
-pub(super) fn in_halves([m, v]: [f32; 2], chance: u32) -> u32 {
-    let first = m.to_bits().wrapping_add(chance & 0xffff);
-    let second = v.to_bits().wrapping_add(chance >> 16);
-    first & 0xffff_0000 | second >> 16
 }
 
 /// The parameter and both moments after the step.
@@ -72,12 +50,9 @@ pub(super) fn bounded<T: Real>(plane: usize, [p, m, v]: [T; 3]) -> [T; 3] {
 }
 
 /// Parameter `i`, its gradient and both moments; `trained` is its index among the trained ones.
-fn before(constants: &Constants, slices: &Slices<'_>, i: usize, trained: usize) -> [f32; 4] {
-    let [m, v] = match constants.half_moments {
-        true => from_halves(slices.both_moments[trained]),
-        false => [slices.first_moments[trained], slices.second_moments[trained]],
-    };
-    [slices.parameters[i], slices.gradients[trained], m, v]
+fn before(slices: &Slices<'_>, i: usize, trained: usize) -> [f32; 4] {
+    let Slices { parameters, gradients, first_moments, second_moments, .. } = slices;
+    [parameters[i], gradients[trained], first_moments[trained], second_moments[trained]]
 }
 
 impl Reference for Kernel {
@@ -90,19 +65,14 @@ impl Reference for Kernel {
         let left_out = frozen_floats(constants.frozen_columns, gaussian_count);
         for i in frozen..params.column_count as usize * gaussian_count {
             let trained = i - left_out;
-            let before = before(constants, &slices, i, trained);
+            let before = before(&slices, i, trained);
             let [parameter, first, second] = updated(params, i / gaussian_count, before);
             slices.parameters[i] = parameter;
-            if constants.half_moments {
-                let (moments, chance) = moments_after(params.step, before);
-                slices.both_moments[trained] = in_halves(moments, chance);
-            } else {
-                (slices.first_moments[trained], slices.second_moments[trained]) = (first, second);
-            }
+            (slices.first_moments[trained], slices.second_moments[trained]) = (first, second);
         }
     }
 
-    /// Twice the running error, since the reference rounds too. Half moments are rounded identically.
+    /// Twice the running error, since the reference rounds too.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let count =
             if slices.status[0] == 0 { params.column_count * params.gaussian_count } else { 0 };
@@ -113,7 +83,7 @@ impl Reference for Kernel {
                 if i < frozen {
                     return 0.0;
                 }
-                let before = before(constants, &slices, i, i - left_out);
+                let before = before(&slices, i, i - left_out);
                 let column = i / params.gaussian_count as usize;
                 2.0 * updated::<Rounded>(params, column, before)[which].error
             };
@@ -121,10 +91,7 @@ impl Reference for Kernel {
             (first..count as usize).map(of).collect()
         };
         let parameters = bounds(0);
-        if constants.half_moments {
-            return Tolerances { parameters, ..Tolerances::default() };
-        }
         let [first_moments, second_moments] = [1, 2].map(bounds);
-        Tolerances { parameters, first_moments, second_moments, ..Tolerances::default() }
+        Tolerances { parameters, first_moments, second_moments }
     }
 }

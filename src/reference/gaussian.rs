@@ -135,15 +135,21 @@ impl Planes {
 
     /// Writes Gaussian `i` through `set`, which takes index and value.
     pub fn store(self, gaussian: &Gaussian, i: usize, mut set: impl FnMut(usize, f64)) {
-        let sh = |range: Range<usize>| gaussian.sh[range].iter().flat_map(DVec3::to_array);
-        let values = (gaussian.mean.to_array().into_iter())
-            .chain(gaussian.quat.to_array())
-            .chain(gaussian.log_scale.to_array())
-            .chain([gaussian.raw_opacity])
+        self.indices(i).zip(gaussian.values()).for_each(|(at, value)| set(at, value));
+    }
+}
+
+impl Gaussian {
+    /// Its numbers in the order of the planes.
+    pub(super) fn values(&self) -> impl Iterator<Item = f64> {
+        let sh = |range: Range<usize>| self.sh[range].iter().flat_map(DVec3::to_array);
+        (self.mean.to_array().into_iter())
+            .chain(self.quat.to_array())
+            .chain(self.log_scale.to_array())
+            .chain([self.raw_opacity])
             .chain(sh(0..1))
-            .chain(gaussian.features.iter().copied())
-            .chain(sh(1..gaussian.sh.len()));
-        self.indices(i).zip(values).for_each(|(at, value)| set(at, value));
+            .chain(self.features.iter().copied())
+            .chain(sh(1..self.sh.len()))
     }
 }
 

@@ -3,7 +3,7 @@
 use glam::{DMat3, DVec2, DVec3, DVec4, UVec2};
 
 use super::camera::ReferenceCamera;
-use super::gaussian::{Gaussian, Planes, sigmoid};
+use super::gaussian::{Gaussian, Planes, Words, sigmoid};
 use super::lamp::ReferenceLamp;
 use super::rotation::{rotation, unit_quat};
 use super::rounding::{Rounded, UNIT, chain, sensitivity};
@@ -126,7 +126,12 @@ fn rows_backward(
 }
 
 /// The gradient of the mean through the viewing direction, and those of the SH coefficients.
-fn sh_backward(degree: u32, sh: &[DVec3], offset: DVec3, d_color: DVec3) -> (DVec3, Vec<DVec3>) {
+pub(super) fn sh_backward(
+    degree: u32,
+    sh: &[DVec3],
+    offset: DVec3,
+    d_color: DVec3,
+) -> (DVec3, Vec<DVec3>) {
     let distance = offset.length().max(1e-12);
     let direction = offset / distance;
     let basis = sh_basis(degree, direction);
@@ -210,15 +215,25 @@ impl<'a> BackwardInputs<'a> {
     ) -> Gaussian {
         let (degree, antialiased) = (self.params.sh_degree, self.constants.antialiased);
         let splat = (splat, self.lamp.map(|lamp| Lit { lamp, color }));
-        let mut gradient =
-            project_gaussian_backward(&self.camera, degree, antialiased, gaussian, splat, d_splat);
-        if self.constants.color_gradients {
-            let rest = &mut gradient.sh[1..];
-            rest.fill(DVec3::ZERO);
-            let d_color = self.d_color(gaussian, d_splat.color, color);
-            rest.first_mut().into_iter().for_each(|first| *first = d_color);
+        let of = |gaussian: &Gaussian| {
+            project_gaussian_backward(&self.camera, degree, antialiased, gaussian, splat, d_splat)
+        };
+        if !self.constants.color_gradients {
+            return of(gaussian);
         }
+        // Of a colour that does not depend on the direction; in place of the coefficients, the gradient of the colour.
+        let mut gradient = of(&Gaussian { sh: vec![gaussian.sh[0]], ..gaussian.clone() });
+        let d_color = self.d_color(gaussian, d_splat.color, color);
+        gradient.sh.extend((gaussian.sh.len() > 1).then_some(d_color));
         gradient
+    }
+
+    /// Calls `take` with the place of each gradient of Gaussian `i` among the planes of all parameters, and its value.
+    fn store(&self, gradient: &Gaussian, i: usize, mut take: impl FnMut(usize, f64)) {
+        let Planes { count, feature_count, rest_by_column, .. } = self.planes;
+        let columns = self.written_columns();
+        let places = Words { count, feature_count, columns, rest_by_column }.of_gaussian(i);
+        places.zip(gradient.values()).for_each(|(at, value)| take(at, value));
     }
 
     /// The colour of Gaussian `i` in the forward pass.
@@ -330,7 +345,7 @@ impl Reference for Kernel {
             let gradient = scene.backward(&gaussian, &splat, color, &d_splat);
             let d_color = scene.d_color(&gaussian, d_splat.color, color);
             let mut is_finite = (8.0 * d_color.as_vec3()).is_finite();
-            scene.planes.store(&gradient, i, |at, value| {
+            scene.store(&gradient, i, |at, value| {
                 let value = value as f32;
                 is_finite &= value.is_finite() || at < frozen;
                 if (frozen..written).contains(&at) {
@@ -389,7 +404,7 @@ impl Reference for Kernel {
             });
             let d_splat = scene.d_splat(&splat, slices.colors, &values(&record), i);
             let gradient = scene.backward(&gaussian, &splat, color, &d_splat);
-            scene.planes.store(&gradient, i, |at, value| gradients[at] = OFF * value.abs());
+            scene.store(&gradient, i, |at, value| gradients[at] = OFF * value.abs());
             let mut moved = one.load(&bounds, 0);
             // A basis is a polynomial of magnitude 3 and degree 3, which may vanish.
             let [by_lamp, factor] = scene.lamp_error(&gaussian, d_splat.color, color);
@@ -398,7 +413,7 @@ impl Reference for Kernel {
             let basis = (64.0 * UNIT + factor) * d_color.abs();
             moved.sh.iter_mut().for_each(|bound| *bound += basis);
             moved.quat += scene.quat_error(&gaussian, &splat, &d_splat);
-            scene.planes.store(&moved, i, |at, bound| gradients[at] += bound);
+            scene.store(&moved, i, |at, bound| gradients[at] += bound);
             let norm = scene.damped_norm(&gaussian, &d_splat);
             let sum = f64::from(slices.grad_norm_sums[i].abs()) + norm;
             grad_norm_sums[i] = bounds[attributes] + 16.0 * UNIT * norm + 2.0 * UNIT * sum;

@@ -30,20 +30,20 @@ pub(crate) fn rest_by_column(gpu: &Gpu) -> bool {
 
 /// What the backward pass writes of the gradients of SH coefficients above degree 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum GradientKind {
+pub enum GradientKind {
     /// All of them.
     All,
-    /// That of the colour, from which Adam computes them: the first three numbers of their plane, column by column.
+    /// That of the colour in place of the first three, from which `adam_gaussian` computes them and what they add to
+    /// the gradient of the mean, through the viewing direction.
     Colors,
 }
 
 impl GradientKind {
-    /// The kind for coefficients and moments of these formats. A GPU, whose memory is the limit, gets the gradients of
-    /// colours if all numbers are 32-bit floats. The rounding of shorter ones depends on every bit of a gradient, and a
-    /// CPU reads gradients four at a time.
+    /// The kind for coefficients and moments of these formats. Those of colours are less to write and to read; but a
+    /// CPU updates 32-bit floats faster four at a time, whatever their Gaussian.
     pub(crate) fn on(gpu: &Gpu, formats: [StorageFormat; 2]) -> Self {
         let are_single = formats == [StorageFormat::Single; 2];
-        if rest_by_column(gpu) && are_single { Self::Colors } else { Self::All }
+        if gpu.properties().is_cpu && are_single { Self::All } else { Self::Colors }
     }
 }
 

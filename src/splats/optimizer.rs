@@ -12,10 +12,11 @@ use std::sync::OnceLock;
 
 use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Slice, SliceMut, Threads};
 use crate::kernels::sh::MAX_SH_DEGREE;
-use crate::kernels::{self, adam, adam_gaussian, adam_rest};
-use crate::splats::attributes::{Attribute, PlaneCounts};
+use crate::kernels::{self, adam, adam_gaussian};
+use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::{Batch, frozen_floats, rest_by_column};
 use crate::splats::packed_sh::StorageFormat;
+use crate::splats::scene::Layout;
 use crate::{Error, Result};
 
 /// Adam's exponential moving averages of gradients and squared gradients: planes in the layout of the parameters, in
@@ -121,11 +122,6 @@ impl<P> Moments<P> {
 }
 
 impl<'a> Moments<SliceMut<'a, f32>> {
-    /// Reborrows them.
-    fn reborrow(&mut self) -> Moments<SliceMut<'_, f32>> {
-        self.as_mut().map(SliceMut::reborrow)
-    }
-
     /// The bindings of a kernel: first moments, second moments, packed moments; those that do not apply are empty.
     fn bindings(self) -> Result<[SliceMut<'a, f32>; 3]> {
         match self {
@@ -154,32 +150,18 @@ pub struct AdamBuffers<'a> {
     pub moments: Moments<SliceMut<'a, f32>>,
 }
 
-impl AdamBuffers<'_> {
-    /// Reborrows them.
-    pub(crate) fn reborrow(&mut self) -> AdamBuffers<'_> {
-        let Self { parameters, gradients, moments } = self;
-        AdamBuffers {
-            parameters: parameters.reborrow(),
-            gradients: *gradients,
-            moments: moments.reborrow(),
-        }
-    }
-}
-
 /// Adam with beta 0.9 and 0.999, epsilon 1e-15 (Kingma and Ba 2015; the constants of 3DGS).
 #[derive(Debug)]
 pub struct Adam {
     gpu: Gpu,
-    /// Kernels for 32-bit moments and, built on first use, for 16-bit ones.
-    floats: [OnceLock<Pipeline<adam::Kernel>>; 2],
+    /// The kernel for 32-bit numbers of any kind.
+    floats: OnceLock<Pipeline<adam::Kernel>>,
     /// The same without the frozen columns.
-    trained: [OnceLock<Pipeline<adam::Kernel>>; 2],
+    trained: OnceLock<Pipeline<adam::Kernel>>,
     /// The columns of the Gaussians, from the first, that do not change.
     frozen_columns: u32,
-    /// The kernels for packed SH coefficients.
-    halves: [OnceLock<Pipeline<adam_rest::Kernel>>; 2],
-    /// The kernels for whole Gaussians, by stored SH degree.
-    gaussians: [OnceLock<Pipeline<adam_gaussian::Kernel>>; DEGREES],
+    /// The kernels for whole Gaussians, by stored SH degree and by the formats of coefficients and moments.
+    gaussians: [OnceLock<Pipeline<adam_gaussian::Kernel>>; 4 * DEGREES],
 }
 
 const DEGREES: usize = MAX_SH_DEGREE as usize + 1;
@@ -197,12 +179,13 @@ pub struct AdamStep<'a> {
 
 /// A step over whole Gaussians, whose gradients above SH degree 0 are those of colours.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct GaussianStep<'a> {
-    pub(crate) adam: AdamStep<'a>,
-    /// The SH degrees that are stored and in use.
-    pub(crate) sh_degrees: [u32; 2],
+pub struct GaussianStep<'a> {
+    /// What it shares with others.
+    pub adam: AdamStep<'a>,
+    /// The SH degree in use.
+    pub sh_degree: u32,
     /// The camera of the step: its buffer and index.
-    pub(crate) camera: (&'a Buffer<kernels::Camera>, u32),
+    pub camera: (&'a Buffer<kernels::Camera>, u32),
 }
 
 impl Adam {
@@ -211,23 +194,21 @@ impl Adam {
         Self::with_frozen(gpu, 0)
     }
 
-    /// Builds the kernel, which leaves the first columns of Gaussians as they are; those for packed coefficients are
-    /// built on first use.
+    /// Builds the kernel; those for whole Gaussians are built on first use. All leave the first columns of Gaussians as
+    /// they are.
     pub fn with_frozen(gpu: &Gpu, frozen_columns: u32) -> Result<Self> {
         let adam = Self {
             gpu: gpu.clone(),
             floats: Default::default(),
             trained: Default::default(),
             frozen_columns,
-            halves: Default::default(),
             gaussians: Default::default(),
         };
-        let constants = adam::Constants { half_moments: false, frozen_columns: 0 };
-        adam.pipeline(&adam.floats, 0, &constants)?;
+        adam.pipeline(&adam.floats, &adam::Constants { frozen_columns: 0 })?;
         Ok(adam)
     }
 
-    /// Records a step over `planes`, which may be a part of all.
+    /// Records a step over `planes`, which may be a part of all. Moments are in 32 bits.
     pub fn record(
         &self,
         pass: &mut Recorder<'_>,
@@ -260,11 +241,11 @@ impl Adam {
         let len = planes.total();
         let left = frozen_floats(frozen_columns, planes.gaussians);
         check(step, status, [(parameters.as_slice(), len), (gradients, len - left)], &moments)?;
-        let half_moments = moments.bits() == StorageFormat::Half;
-        let constants = adam::Constants { half_moments, frozen_columns };
-        let pipelines = if frozen_columns == 0 { &self.floats } else { &self.trained };
-        let pipeline = self.pipeline(pipelines, half_moments.into(), &constants)?;
-        let [first_moments, second_moments, both_moments] = moments.bindings()?;
+        let Moments::Single { first: first_moments, second: second_moments } = moments else {
+            return Err(Error::Usage("16-bit moments are those of whole Gaussians".to_owned()));
+        };
+        let built = if frozen_columns == 0 { &self.floats } else { &self.trained };
+        let pipeline = self.pipeline(built, &adam::Constants { frozen_columns })?;
         let (uncorrected, second_correction) = corrections(step);
         pass.dispatch(
             pipeline,
@@ -273,7 +254,6 @@ impl Adam {
                 column_count: planes.columns as u32,
                 feature_count: planes.features as u32,
                 second_correction,
-                step: step as u32,
                 rates: rates.0.map(|rate| (rate / uncorrected) as f32),
             },
             adam::Buffers {
@@ -281,83 +261,47 @@ impl Adam {
                 gradients,
                 first_moments,
                 second_moments,
-                both_moments: both_moments.words(),
                 status: status.slice(),
             },
             Threads::Exactly([(len - left).div_ceil(4) as u32, 1, 1]),
         )
     }
 
-    /// [`Adam::record`] for the packed SH coefficients above degree 0 of `planes`.
-    pub fn record_halves(
+    /// Records a step of Gaussians in this layout, a batch of all.
+    pub fn record_gaussians(
         &self,
         pass: &mut Recorder<'_>,
-        AdamStep { step, rates, status }: AdamStep<'_>,
-        planes: PlaneCounts,
+        GaussianStep { adam, sh_degree, camera }: GaussianStep<'_>,
+        layout: Layout,
         AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
     ) -> Result<()> {
-        let words = planes.gaussians * StorageFormat::Half.words(planes);
-        let frozen_columns = self.frozen_columns;
-        let floats = planes.total() - frozen_floats(frozen_columns, planes.gaussians);
+        let (AdamStep { step, rates, status }, frozen_columns) = (adam, self.frozen_columns);
+        let floats = layout.floats().total() - frozen_floats(frozen_columns, layout.count);
+        let words = layout.count * layout.words();
         check(step, status, [(parameters.as_slice(), words), (gradients, floats)], &moments)?;
-        let [gaussian_count, first_column, coefficient_count] =
-            [planes.gaussians, planes.before_rest(), planes.rest()].map(|n| n as u32);
-        let half_moments = moments.bits() == StorageFormat::Half;
-        let rest_by_column = rest_by_column(&self.gpu);
-        let constants = adam_rest::Constants { half_moments, rest_by_column, frozen_columns };
-        let pipeline = self.pipeline(&self.halves, half_moments.into(), &constants)?;
-        let [first_moments, second_moments, both_moments] = moments.bindings()?;
-        let (uncorrected, second_correction) = corrections(step);
-        pass.dispatch(
-            pipeline,
-            &adam_rest::Params {
-                gaussian_count,
-                first_column,
-                coefficient_count,
-                rate: (rates[Attribute::Rest] / uncorrected) as f32,
-                second_correction,
-                step: step as u32,
-            },
-            adam_rest::Buffers {
-                parameters: parameters.words(),
-                gradients,
-                first_moments,
-                second_moments,
-                both_moments: both_moments.words(),
-                status: status.slice(),
-            },
-            Threads::Exactly([gaussian_count * coefficient_count.div_ceil(4), 1, 1]),
-        )
-    }
-
-    /// Records a step over all columns of `planes`, of the SH degree in use.
-    pub(crate) fn record_gaussians(
-        &self,
-        pass: &mut Recorder<'_>,
-        GaussianStep { adam, sh_degrees, camera }: GaussianStep<'_>,
-        planes: PlaneCounts,
-        AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
-    ) -> Result<()> {
-        let AdamStep { step, rates, status } = adam;
-        let (len, frozen_columns) = (planes.total(), self.frozen_columns);
-        let floats = len - frozen_floats(frozen_columns, planes.gaussians);
-        check(step, status, [(parameters.as_slice(), len), (gradients, floats)], &moments)?;
-        let Moments::Single { first: first_moments, second: second_moments } = moments else {
-            return Err(Error::Usage("whole Gaussians have moments of 32 bits".to_owned()));
+        let stored = layout.shape.sh_degree;
+        let [half_rest, half_moments] =
+            [layout.sh_rest, moments.bits()].map(|format| format == StorageFormat::Half);
+        let constants = adam_gaussian::Constants {
+            sh_degree: stored,
+            feature_count: layout.shape.features.width() as u32,
+            half_rest,
+            half_moments,
+            rest_by_column: rest_by_column(&self.gpu),
+            frozen_columns,
         };
-        let ([sh_degree, used], feature_count) = (sh_degrees, planes.features as u32);
-        let rest_by_column = rest_by_column(&self.gpu);
-        let constants =
-            adam_gaussian::Constants { sh_degree, feature_count, rest_by_column, frozen_columns };
-        let pipeline = self.pipeline(&self.gaussians, sh_degree as usize, &constants)?;
+        let which = 4 * stored as usize + 2 * usize::from(half_rest) + usize::from(half_moments);
+        let pipeline = self.pipeline(&self.gaussians[which], &constants)?;
+        let [first_moments, second_moments, both_moments] = moments.bindings()?;
         let (uncorrected, second_correction) = corrections(step);
         pass.dispatch(
             pipeline,
             &adam_gaussian::Params {
                 camera_index: camera.1,
-                gaussian_count: planes.gaussians as u32,
-                sh_degree: used,
+                gaussian_count: layout.count as u32,
+                sh_degree: sh_degree.min(stored),
                 second_correction,
+                step: step as u32,
                 rates: rates.0.map(|rate| (rate / uncorrected) as f32),
             },
             adam_gaussian::Buffers {
@@ -365,20 +309,19 @@ impl Adam {
                 gradients,
                 first_moments,
                 second_moments,
+                both_moments: both_moments.words(),
                 status: status.slice(),
                 cameras: camera.0.slice(),
             },
-            Threads::Exactly([planes.gaussians as u32, 1, 1]),
+            Threads::Exactly([layout.count as u32, 1, 1]),
         )
     }
 
     fn pipeline<'a, K: Kernel>(
         &self,
-        pipelines: &'a [OnceLock<Pipeline<K>>],
-        which: usize,
+        built: &'a OnceLock<Pipeline<K>>,
         constants: &K::Constants,
     ) -> Result<&'a Pipeline<K>> {
-        let built = &pipelines[which];
         if let Some(pipeline) = built.get() {
             return Ok(pipeline);
         }

@@ -76,7 +76,7 @@ pub struct Damping {
 /// Outputs of the backward pass, for all Gaussians.
 #[derive(Debug)]
 pub struct Gradients<'a> {
-    /// (columns x Gaussians): the gradient of every parameter.
+    /// (columns x Gaussians): the gradients of the parameters, all of them unless the renderer is made for Adam.
     pub parameters: &'a mut Buffer<f32>,
     /// (Gaussians): sums of the norms of the screen-space gradients in normalised device units.
     pub grad_norm_sums: &'a mut Buffer<f32>,

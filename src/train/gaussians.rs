@@ -8,7 +8,6 @@ use crate::splats::attributes::{AttributePlane, PlaneCounts, planes};
 use crate::splats::batches::{Batches, GradientKind};
 use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, Round};
 use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, GaussianStep, Moments};
-use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{DeviceGaussians, GaussianSlice, Gaussians, Layout, Shape};
 
 /// Planes of every attribute with their moments and gradients, and the statistics of density control. Buffers may be
@@ -131,8 +130,8 @@ impl TrainedGaussians {
         self.values.layout.capacity
     }
 
-    /// Records a step of Adam over the columns of the SH degree in use, the second of the step's degrees, with
-    /// gradients of this kind. Nothing changes while the first element of its status is not zero.
+    /// Records a step of Adam over the columns of the SH degree in use, with gradients of this kind. Nothing changes
+    /// while the first element of its status is not zero.
     pub(super) fn update(
         &mut self,
         gpu: &Gpu,
@@ -141,28 +140,21 @@ impl TrainedGaussians {
         step: GaussianStep<'_>,
         kind: GradientKind,
     ) -> Result<()> {
-        let [_, sh_degree] = step.sh_degrees;
-        let Self { values, moments, .. } = self;
+        let Self { values, moments, gradients, frozen_columns, .. } = self;
         let layout = values.layout;
-        let is_half = layout.sh_rest == StorageFormat::Half;
-        layout.batches(gpu).without(self.frozen_columns).iter().try_for_each(|batch| {
-            let planes = PlaneCounts { gaussians: batch.count, ..layout.floats() };
-            let mut buffers = AdamBuffers {
+        layout.batches(gpu).without(*frozen_columns).iter().try_for_each(|batch| {
+            let buffers = AdamBuffers {
                 parameters: batch.rows_mut(&mut values.parameters, layout.words())?,
-                gradients: batch.planes(&self.gradients)?,
+                gradients: batch.planes(&*gradients)?,
                 moments: moments.of_batch(&batch)?,
             };
+            let layout = Layout { count: batch.count, ..layout };
             if kind == GradientKind::Colors {
-                return adam.record_gaussians(pass, step, planes, buffers);
+                return adam.record_gaussians(pass, step, layout, buffers);
             }
-            let columns =
-                if sh_degree == 0 || is_half { planes.before_rest() } else { planes.columns };
-            let floats = PlaneCounts { columns, ..planes };
-            adam.record_trained(pass, step.adam, floats, buffers.reborrow())?;
-            if sh_degree == 0 || !is_half {
-                return Ok(());
-            }
-            adam.record_halves(pass, step.adam, planes, buffers)
+            let planes = layout.floats();
+            let columns = if step.sh_degree == 0 { planes.before_rest() } else { planes.columns };
+            adam.record_trained(pass, step.adam, PlaneCounts { columns, ..planes }, buffers)
         })
     }
 
@@ -233,9 +225,13 @@ impl TrainedGaussians {
         }
     }
 
-    /// The gradients of all parameters in the last step.
-    pub(super) fn download_gradients(&self, gpu: &Gpu) -> Result<Gaussians> {
-        let parameters = self.trained_planes(gpu).read(gpu, &self.gradients)?;
+    /// The gradients that the last step wrote, of this kind; zeros where it writes none.
+    pub(super) fn download_gradients(&self, gpu: &Gpu, kind: GradientKind) -> Result<Gaussians> {
+        let mut parameters = self.trained_planes(gpu).read(gpu, &self.gradients)?;
+        let planes = self.values.layout.floats();
+        if kind == GradientKind::Colors {
+            parameters[planes.gaussians * planes.before_rest()..].fill(0.0);
+        }
         let (Layout { count, shape, .. }, origin) = (self.values.layout, self.values.origin);
         Ok(Gaussians { count, shape, parameters, origin })
     }
@@ -260,6 +256,7 @@ fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, batches: Batches) -> Result<()>
 mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
+    use crate::splats::packed_sh::StorageFormat;
     use crate::splats::scene::Features;
 
     #[test]

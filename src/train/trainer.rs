@@ -325,7 +325,7 @@ impl Trainer {
         let status = renderer.status();
         let gaussian_step = GaussianStep {
             adam: AdamStep { step, rates: &rates, status },
-            sh_degrees: [gaussians.shape().sh_degree, options.sh_degree],
+            sh_degree: options.sh_degree,
             camera: renderer.camera_of(&supervision.views.viewpoint(view)),
         };
         gaussians.update(gpu, pass, &optimizer.adam, gaussian_step, renderer.gradient_kind())?;
@@ -374,10 +374,12 @@ impl Trainer {
         Ok(self.model.renderer.lamp()?.map(|lamp| lamp.scaled(1.0 / self.scene.frame.scale)))
     }
 
-    /// The gradients of all parameters in the last step, in the frame.
+    /// The gradients that the last step wrote, in the frame: with `GradientKind::Colors` zeros above SH degree 0, and
+    /// those of the means lack the part through the viewing direction.
     #[doc(hidden)]
     pub fn gradients(&self) -> Result<Gaussians> {
-        self.model.gaussians.download_gradients(&self.gpu)
+        let kind = self.model.renderer.gradient_kind();
+        self.model.gaussians.download_gradients(&self.gpu, kind)
     }
 
     /// The floats of a plane set of gradients or moments.

@@ -224,6 +224,10 @@ impl<'a> Chain<'a> {
         let d_render: Vec<f32> = self.d_render.iter().map(|&d| d as f32).collect();
         let gradients = rendered.backward(&d_render);
         check("gradient", &gradients.parameters, |results| &results.gradient, 1.0);
+        let trained = Setup { is_trained: true, ..self.setup.clone() };
+        let completed = trained.render().backward(&d_render);
+        check("Adam's gradient", &completed.parameters, |results| &results.gradient, 1.0);
+        assert_eq!(completed.grad_norm_sums, gradients.grad_norm_sums, "{name}");
         let norms: Vec<f32> =
             gradients.grad_norm_sums.iter().map(|sum| sum - Rendered::NORM_BEFORE).collect();
         check("gradient norm", &norms, |results| &results.grad_norms, 1.0);

@@ -1,19 +1,23 @@
 //! Gaussians and a view of them, rendered by the shipped renderer.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, DVec4, UVec2, Vec2};
-use nightsplat::gpu::Tile;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::{Buffer, Tile};
+use nightsplat::kernels::adam_step::BETA1;
 use nightsplat::kernels::camera_pinhole::JACOBIAN_MARGIN;
 use nightsplat::reference::camera::fisheye::Fisheye;
 use nightsplat::reference::camera::pinhole::Pinhole;
 use nightsplat::reference::camera::{ReferenceCamera, ReferenceLens};
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
-use nightsplat::splats::batches::Batches;
+use nightsplat::splats::batches::{Batches, GradientKind};
 use nightsplat::splats::lamp::Lamp;
+use nightsplat::splats::optimizer::{
+    Adam, AdamBuffers, AdamStep, GaussianStep, LearningRates, Moments,
+};
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::{DeviceGaussians, Features, Gaussians, Shape};
-use nightsplat_core::camera::{self, CameraModel, KannalaBrandt};
+use nightsplat_core::camera::{self, CameraModel, KannalaBrandt, Patch};
 use nightsplat_photographs::tone::Profile;
 
 use super::Random;
@@ -41,6 +45,8 @@ pub(crate) struct Setup {
     pub(crate) options: RenderOptions,
     /// The splats of a segment of a tile's run; 0: a run has one. `None`: as the device has it.
     pub(crate) segment: Option<u32>,
+    /// Whether gradients are those of a step of Adam, which completes those of the renderer.
+    pub(crate) is_trained: bool,
 }
 
 impl Setup {
@@ -76,8 +82,15 @@ impl Setup {
         };
         let settings = RenderSettings { shape, ..RenderSettings::default() };
         let options = RenderOptions { sh_degree: shape.sh_degree, background: [0.0, 0.1, 0.2] };
-        let mut setup =
-            Self { count, parameters: vec![], camera, settings, options, segment: None };
+        let mut setup = Self {
+            count,
+            parameters: vec![],
+            camera,
+            settings,
+            options,
+            segment: None,
+            is_trained: false,
+        };
         setup.parameters = vec![0.0; setup.planes().float_count()];
         let mut random = Random::new(seed);
         for i in 0..count {
@@ -246,6 +259,9 @@ impl<'a> Rendered<'a> {
         let gaussians = setup.upload();
         let (gpu, settings) = (gpu(), setup.settings);
         let mut renderer = match setup.segment {
+            None if setup.is_trained => {
+                Renderer::with_gradients(&gpu, settings, GradientKind::Colors, 0)
+            }
             None => Renderer::new(&gpu, settings),
             Some(splats) => Renderer::with_segments(&gpu, settings, splats),
         }
@@ -281,7 +297,7 @@ impl<'a> Rendered<'a> {
 
     /// The gradients from that of the render, (channels, H, W).
     pub(crate) fn backward(&mut self, d_render: &[f32]) -> Gradients {
-        let (gpu, Self { setup, gaussians, renderer, .. }) = (gpu(), self);
+        let (gpu, Self { setup, gaussians, renderer, .. }) = (gpu(), &mut *self);
         let d_render = gpu.buffer("d_render", d_render).unwrap();
         let unwritten = vec![f32::NAN; setup.parameters.len()];
         let mut parameters = gpu.buffer("gradients", &unwritten).unwrap();
@@ -307,12 +323,44 @@ impl<'a> Rendered<'a> {
             )
         })
         .unwrap();
-        let batches = Batches::new(&gpu, gaussians.layout.floats());
+        if setup.is_trained {
+            parameters = self.completed(parameters);
+        }
+        let batches = Batches::new(&gpu, self.gaussians.layout.floats());
         Gradients {
             parameters: batches.read(&gpu, &parameters).unwrap(),
             grad_norm_sums: gpu.read(&grad_norm_sums).unwrap(),
             visit_counts: gpu.read(&visit_counts).unwrap(),
         }
+    }
+
+    /// The gradients that a step of Adam takes, by its first moments, from those that the renderer writes.
+    fn completed(&mut self, written: Buffer<f32>) -> Buffer<f32> {
+        let (gpu, Self { setup, gaussians, .. }) = (gpu(), self);
+        let layout = gaussians.layout;
+        let mut moments = Moments::zeros(&gpu, layout.floats().total()).unwrap();
+        let camera = [(&Patch::from(&setup.camera)).into()];
+        let (camera, status) =
+            (gpu.buffer("camera", &camera).unwrap(), gpu.zeros("status", 1).unwrap());
+        gpu.run("adam", |pass| {
+            let rates = &LearningRates::uniform(1e-3);
+            let step = GaussianStep {
+                adam: AdamStep { step: 1, rates, status: &status },
+                sh_degree: setup.options.sh_degree,
+                camera: (&camera, 0),
+            };
+            let buffers = AdamBuffers {
+                parameters: gaussians.parameters.slice_mut(),
+                gradients: written.slice(),
+                moments: moments.slice_mut(),
+            };
+            Adam::new(&gpu)?.record_gaussians(pass, step, layout, buffers)
+        })
+        .unwrap();
+        let Moments::Single { first, .. } = &moments else { panic!("{moments:?}") };
+        let of = |moment: &f32| (f64::from(*moment) / (1.0 - BETA1)) as f32;
+        let gradients: Vec<f32> = gpu.read(first).unwrap().iter().map(of).collect();
+        gpu.buffer("completed", &gradients).unwrap()
     }
 }
 

@@ -10,7 +10,7 @@
 //! m = b1 m + (1 - b1) g, v = b2 v + (1 - b2) g^2, p -= rate / (1 - b1^t) m / (sqrt(v) / sqrt(1 - b2^t) + epsilon). A
 //! thread processes four consecutive floats, of one plane or of two. A gradient that is not finite counts as zero, so
 //! that it corrupts neither moment; log scales stay within bounds whose exp is finite. Nothing changes while status[0]
-//! is set. Moments are two floats, or both in one word. Kingma and Ba 2015. Reference: `src/reference/adam.rs`.
+//! is set. Kingma and Ba 2015. Reference: `src/reference/adam.rs`.
 
 layout(local_size_x = 256) in;
 
@@ -19,19 +19,16 @@ layout(push_constant) uniform Params {
     uint  column_count;         // updated columns, from the first
     uint  feature_count;        // of these, from FEATURES_COLUMN on
     float second_correction;    // 1 / sqrt(1 - b2^t)
-    uint  step;                 // t
     float rates[PLANE_COUNT];   // learning rates / (1 - b1^t), one per plane
 };
 
-layout(constant_id = 0) const bool HALF_MOMENTS = false;
 #include "trained.glsl"
 
 layout(binding = 0)           buffer Parameters    { vec4 parameters[]; };      // planes
 layout(binding = 1) readonly  buffer Gradients     { vec4 gradients[]; };       // trained planes
-layout(binding = 2)           buffer FirstMoments  { vec4 first_moments[]; };   // as many; none with half moments
+layout(binding = 2)           buffer FirstMoments  { vec4 first_moments[]; };   // as many
 layout(binding = 3)           buffer SecondMoments { vec4 second_moments[]; };  // as many
-layout(binding = 4)           buffer BothMoments   { uvec4 both_moments[]; };    // their bits, with half moments
-layout(binding = 5) readonly  buffer Status        { uint status[]; };
+layout(binding = 4) readonly  buffer Status        { uint status[]; };
 
 // The learning rates of the floats at `i`.
 vec4 rates_at(uvec4 i) {
@@ -52,23 +49,13 @@ void main() {
     // The first and the last quad can extend into a column that is not updated. Unsigned: before `begin`, it wraps.
     bvec4 takes_part = lessThan(i - begin, uvec4(end - begin));
     vec4 gradient = clamp_gradient(gradients[trained]);
-    Moments moments;
-    if (HALF_MOMENTS) moments = from_halves(both_moments[trained]);
-    else moments = Moments(first_moments[trained], second_moments[trained]);
-    moments = updated(moments, gradient);
-    if (HALF_MOMENTS) moments = flushed(moments);
+    Moments moments = updated(Moments(first_moments[trained], second_moments[trained]), gradient);
     vec4 before = parameters[quad];
     vec4 value = before - adam_step(moments, rates_at(i), second_correction);
     // Unsigned: values before the plane wrap beyond its end.
     bvec4 is_log_scale = lessThan(i - LOG_SCALES_COLUMN * gaussian_count, uvec4(3 * gaussian_count));
     value = mix(value, clamp(value, LOG_SCALE_MIN, LOG_SCALE_MAX), is_log_scale);
     parameters[quad] = mix(before, value, takes_part);
-    if (HALF_MOMENTS) {
-        // As integers: a device may flush a float whose bits are those of a second moment alone.
-        uvec4 halves = in_halves(moments, chance_of(before, moments, step));
-        both_moments[trained] = mix(both_moments[trained], halves, takes_part);
-    } else {
-        first_moments[trained] = mix(first_moments[trained], moments.first, takes_part);
-        second_moments[trained] = mix(second_moments[trained], moments.second, takes_part);
-    }
+    first_moments[trained] = mix(first_moments[trained], moments.first, takes_part);
+    second_moments[trained] = mix(second_moments[trained], moments.second, takes_part);
 }

@@ -8,97 +8,174 @@
 #include "sh.glsl"
 #include "adam_step.glsl"
 
-//! Adam over whole Gaussians, one thread for each, with the numbers and the bits of adam.comp.
+//! Adam over whole Gaussians, one thread for each; its rule is that of adam.comp.
 //!
-//! The gradient of an SH coefficient is its basis function in the viewing direction times the gradient of the colour.
-//! It is computed here: `project_backward` only writes the three numbers of the colour, in place of the first ones of
-//! the coefficients above degree 0. On a GPU that is less than half of the memory traffic of gradients. All numbers are
-//! 32-bit floats. Reference: `src/reference/adam_gaussian.rs`.
+//! Of the gradients that depend on the viewing direction, `project_backward` only writes that of the colour, in place
+//! of the first three of the coefficients above degree 0. The others are computed here: that of a coefficient is its
+//! basis function in the direction times that of the colour, and the mean moves the direction. That is less than half
+//! of the memory traffic of gradients, and one kernel instead of two reads the coefficients.
+//!
+//! Log scales stay within bounds whose exp is finite. Coefficients above degree 0 and moments are 32-bit floats or are
+//! rounded to 16 bits by chance, which preserves the mean. Reference: `src/reference/adam_gaussian.rs`.
 
 layout(local_size_x = 64) in;
 
 layout(push_constant) uniform Params {
     uint  camera_index;
     uint  gaussian_count;
-    uint  sh_degree;          // in use; at most SH_DEGREE. 0: coefficients above degree 0 do not change
-    float second_correction;  // 1 / sqrt(1 - b2^t)
+    uint  sh_degree;           // in use; at most SH_DEGREE. 0: coefficients above degree 0 do not change
+    float second_correction;   // 1 / sqrt(1 - b2^t)
+    uint  step;                // t
     float rates[PLANE_COUNT];  // learning rates / (1 - b1^t), one per plane
 };
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 1) const uint FEATURE_COUNT = 0;
-const bool HALF_REST = false;
+layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in the format of include/half.glsl
+layout(constant_id = 7) const bool HALF_MOMENTS = false;
 #include "trained.glsl"
 
 layout(binding = 0)           buffer Parameters    { float parameters[]; };      // planes
 layout(binding = 1) readonly  buffer Gradients     { float gradients[]; };       // trained planes
-layout(binding = 2)           buffer FirstMoments  { float first_moments[]; };   // as many
-layout(binding = 3)           buffer SecondMoments { float second_moments[]; };  // as many
-layout(binding = 4) readonly  buffer Status        { uint status[]; };
-layout(binding = 5) readonly  buffer Cameras       { Camera cameras[]; };
+layout(binding = 2)           buffer FirstMoments  { float first_moments[]; };   // as many; none with half moments
+layout(binding = 3)           buffer SecondMoments { float second_moments[]; };  // as many; none with half moments
+layout(binding = 4)           buffer BothMoments   { uint both_moments[]; };     // as many; only with half moments
+layout(binding = 5) readonly  buffer Status        { uint status[]; };
+layout(binding = 6) readonly  buffer Cameras       { Camera cameras[]; };
 
 #include "rest.glsl"
 #include "log_scale.glsl"
 
-// Updates the parameters at four places; `count` of them count.
-void update(uvec4 at, uint count, vec4 gradient, vec4 rate, bool is_log_scale) {
-    vec4 value, first, second;
-    [[unroll]] for (uint k = 0; k < 4; k++) {
-        uint index = k < count ? at[k] : at[0];
-        value[k] = parameters[index];
-        first[k] = first_moments[trained_place(index)];
-        second[k] = second_moments[trained_place(index)];
-    }
-    Moments moments = updated(Moments(first, second), clamp_gradient(gradient));
-    value -= adam_step(moments, rate, second_correction);
-    if (is_log_scale) value = clamp(value, LOG_SCALE_MIN, LOG_SCALE_MAX);
+// The most coefficients above degree 0, in whole vectors of four.
+const uint MAX_REST = 3 * MAX_COEFFICIENTS;
+
+// The values after a step with these gradients, of which `count` count; their moments, at these places, are updated.
+// `chance`: random numbers for rounding the values.
+vec4 stepped(vec4 value, vec4 gradient, float rate, uvec4 place, uint count, out uvec4 chance) {
+    Moments moments = Moments(vec4(0.0), vec4(0.0));
+    uvec4 both = uvec4(0);
     [[unroll]] for (uint k = 0; k < 4; k++) {
         if (k >= count) continue;
-        parameters[at[k]] = value[k];
-        first_moments[trained_place(at[k])] = moments.first[k];
-        second_moments[trained_place(at[k])] = moments.second[k];
+        if (HALF_MOMENTS) {
+            both[k] = both_moments[place[k]];
+        } else {
+            moments.first[k] = first_moments[place[k]];
+            moments.second[k] = second_moments[place[k]];
+        }
+    }
+    if (HALF_MOMENTS) moments = from_halves(both);
+    moments = updated(moments, clamp_gradient(gradient));
+    if (HALF_MOMENTS) moments = flushed(moments);
+    chance = chance_of(value, moments, step);
+    if (HALF_MOMENTS) both = in_halves(moments, chance);
+    [[unroll]] for (uint k = 0; k < 4; k++) {
+        if (k >= count) continue;
+        if (HALF_MOMENTS) {
+            both_moments[place[k]] = both[k];
+        } else {
+            first_moments[place[k]] = moments.first[k];
+            second_moments[place[k]] = moments.second[k];
+        }
+    }
+    return value - adam_step(moments, vec4(rate), second_correction);
+}
+
+// Updates an attribute of up to four numbers, whose gradients are the written ones and `further`.
+void update_plane(uint i, uint plane, uint column, uint width, uint first, vec3 further) {
+    uint at = column * gaussian_count + width * i + first;
+    uint count = min(width - first, 4);
+    vec4 value = vec4(0.0), gradient = vec4(0.0);
+    uvec4 place = trained_place(at) + uvec4(0, 1, 2, 3), unused_chance;
+    [[unroll]] for (uint k = 0; k < 4; k++) {
+        if (k >= count) continue;
+        value[k] = parameters[at + k];
+        gradient[k] = gradients[place[k]];
+    }
+    gradient.xyz += further;
+    value = stepped(value, gradient, rates[plane], place, count, unused_chance);
+    if (column == LOG_SCALES_COLUMN) value = clamp(value, LOG_SCALE_MIN, LOG_SCALE_MAX);
+    [[unroll]] for (uint k = 0; k < 4; k++) if (k < count) parameters[at + k] = value[k];
+}
+
+// The place of word k of the coefficients above degree 0.
+uint coefficient_word(uint i, uint k) {
+    return rest_word(REST_COLUMN, HALF_REST ? words_of(rest_width()) : rest_width(), gaussian_count, i, k);
+}
+
+// The coefficients above degree 0, and zeros after them.
+void load_rest(uint i, out float rest[MAX_REST]) {
+    uint width = rest_width();
+    [[unroll]] for (uint k = 0; k < MAX_REST; k += 2) {
+        vec2 pair = vec2(0.0);
+        if (HALF_REST) {
+            if (k < width) pair = unpackHalf2x16(floatBitsToUint(parameters[coefficient_word(i, k / 2)]));
+        } else {
+            if (k < width) pair.x = parameters[coefficient_word(i, k)];
+            if (k + 1 < width) pair.y = parameters[coefficient_word(i, k + 1)];
+        }
+        rest[k] = pair.x;
+        rest[k + 1] = pair.y;
     }
 }
 
-// Updates an attribute of up to four numbers whose gradients are written.
-void update_plane(uint i, uint plane, uint column, uint width, uint first) {
-    uint at = column * gaussian_count + width * i + first;
-    uint count = min(width - first, 4);
-    vec4 gradient = vec4(0.0);
-    [[unroll]] for (uint k = 0; k < 4; k++) if (k < count) gradient[k] = gradients[trained_place(at + k)];
-    update(at + uvec4(0, 1, 2, 3), count, gradient, vec4(rates[plane]), column == LOG_SCALES_COLUMN);
+// Writes four of them, from an even one on, rounded to their format.
+void store_rest(uint i, uint first, vec4 value, uvec4 chance) {
+    uint count = min(rest_width() - first, 4);
+    if (HALF_REST) {
+        value = rounded_by_chance(value, chance);
+        parameters[coefficient_word(i, first / 2)] = uintBitsToFloat(packHalf2x16(value.xy));
+        if (count > 2) parameters[coefficient_word(i, first / 2 + 1)] = uintBitsToFloat(packHalf2x16(value.zw));
+        return;
+    }
+    [[unroll]] for (uint k = 0; k < 4; k++) if (k < count) parameters[coefficient_word(i, first + k)] = value[k];
+}
+
+// Updates the coefficients above degree 0; returns the gradient of the mean through the viewing direction. It is finite
+// where coefficients are below 1e6 and the mean is not at the camera.
+vec3 update_rest(uint i) {
+    Camera camera = cameras[camera_index];
+    vec3 offset = offset_from_camera(LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i), camera.view_from_world);
+    float small, distance, basis[16], rest[MAX_REST];
+    vec3 direction = direction_of(offset, small, distance), basis_gradient[16], d_direction = vec3(0.0);
+    sh_basis(sh_degree, direction, basis);
+    sh_basis_gradient(sh_degree, direction, basis_gradient);
+    vec4 d_color = vec4(0.0);
+    [[unroll]] for (uint c = 0; c < 3; c++)
+        d_color[c] = gradients[trained_place(rest_word(REST_COLUMN, 3, gaussian_count, i, c))];
+    d_color = clamp_gradient(d_color);
+    load_rest(i, rest);
+    [[unroll]] for (uint k = 1; k < MAX_COEFFICIENTS; k++) {
+        vec3 coefficient = vec3(rest[3 * k - 3], rest[3 * k - 2], rest[3 * k - 1]);
+        d_direction += dot(coefficient, d_color.rgb) * basis_gradient[k];
+    }
+    [[unroll]] for (uint first = 0; first < MAX_REST; first += 4) {
+        if (first >= rest_width()) break;
+        vec4 value, gradient;
+        uvec4 place, chance;
+        [[unroll]] for (uint k = 0; k < 4; k++) {
+            uint at = first + k;
+            value[k] = rest[at];
+            gradient[k] = at < rest_width() ? basis[min(1 + at / 3, MAX_COEFFICIENTS - 1)] * d_color[at % 3] : 0.0;
+            place[k] = trained_place(rest_word(REST_COLUMN, rest_width(), gaussian_count, i, at));
+        }
+        value = stepped(value, gradient, rates[PLANE_COUNT - 1], place, min(rest_width() - first, 4), chance);
+        store_rest(i, first, value, chance);
+    }
+    return small * ((d_direction - direction * dot(direction, d_direction)) / distance);
 }
 
 void main() {
     uint i = THREAD_INDEX;
     if (i >= gaussian_count || status[0] != 0) return;
     // Before the mean changes.
-    Camera camera = cameras[camera_index];
-    vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
-    vec3 offset = offset_from_camera(mean, camera.view_from_world);
+    vec3 d_mean = vec3(0.0);
+    if (sh_degree > 0) d_mean = update_rest(i);
     [[unroll]] for (uint plane = 0; plane < PLANE_COUNT - 1; plane++) {
         uint column = plane_column(plane, FEATURE_COUNT, 0);
         if (!is_trained(column)) continue;
         uint width = plane + 2 == PLANE_COUNT ? FEATURE_COUNT : plane_column(plane + 1, FEATURE_COUNT, 0) - column;
-        [[unroll]] for (uint first = 0; first < width; first += 4) update_plane(i, plane, column, width, first);
-    }
-    if (sh_degree == 0) return;
-
-    float unused_scale, unused_distance, basis[16];
-    sh_basis(sh_degree, direction_of(offset, unused_scale, unused_distance), basis);
-    vec3 d_color;
-    for (uint c = 0; c < 3; c++) {
-        d_color[c] = gradients[trained_place(rest_word(REST_COLUMN, rest_width(), gaussian_count, i, c))];
-    }
-    [[unroll]] for (uint first = 0; first < 3 * (MAX_COEFFICIENTS - 1); first += 4) {
-        if (first >= rest_width()) break;
-        uvec4 at;
-        vec4 gradient;
-        [[unroll]] for (uint k = 0; k < 4; k++) {
-            at[k] = rest_word(REST_COLUMN, rest_width(), gaussian_count, i, first + k);
-            uint coefficient = min(1 + (first + k) / 3, MAX_COEFFICIENTS - 1);
-            gradient[k] = basis[coefficient] * d_color[(first + k) % 3];
-        }
-        update(at, min(rest_width() - first, 4), gradient, vec4(rates[PLANE_COUNT - 1]), false);
+        vec3 further = column == MEANS_COLUMN ? d_mean : vec3(0.0);
+        [[unroll]] for (uint first = 0; first < width; first += 4)
+            update_plane(i, plane, column, width, first, further);
     }
 }

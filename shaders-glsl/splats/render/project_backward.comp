@@ -34,8 +34,8 @@ layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 5) const bool RAW_COLORS = false;
 layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in the format of include/half.glsl
 #include "trained.glsl"
-// Of the gradients of SH above degree 0, only that of the colour is written, as `adam_gaussian` reads it; it requires
-// REST_BY_COLUMN.
+// For `adam_gaussian`, which computes what depends on the viewing direction: only the gradient of the colour is written
+// of those of SH above degree 0, and that of the mean lacks the part through the direction.
 layout(constant_id = 13) const bool COLOR_GRADIENTS = false;
 layout(constant_id = 14) const bool ANTIALIASED = false;  // opacities are compensated for the dilation
 layout(constant_id = 16) const bool LAMP = false;  // colours are lit by a lamp at the camera
@@ -68,13 +68,13 @@ const uint FEATURE_COUNT = CHANNELS - 3;
     uint at = trained_place((column) * gaussian_count + 4 * (i)); \
     gradients[at] = (v).x; gradients[at + 1] = (v).y; gradients[at + 2] = (v).z; gradients[at + 3] = (v).w; }
 
-// The place of the gradient of an SH coefficient above degree 0.
-uint rest_gradient(uint i, uint k) {
-    return trained_place(rest_word(REST_COLUMN, rest_width(), gaussian_count, i, k));
-}
-
-// Those that are written, of each Gaussian.
+// The gradients of SH above degree 0 that are written, of each Gaussian.
 uint written_rest() { return COLOR_GRADIENTS ? min(rest_width(), 3) : rest_width(); }
+
+// The place of one of them.
+uint rest_gradient(uint i, uint k) {
+    return trained_place(rest_word(REST_COLUMN, written_rest(), gaussian_count, i, k));
+}
 
 // The gradient of a unit quaternion's rotation matrix.
 vec4 rotation_backward(vec4 q, mat3 d) {
@@ -87,7 +87,7 @@ vec4 rotation_backward(vec4 q, mat3 d) {
     );
 }
 
-// Writes the gradients of the SH coefficients; returns that of the mean, through the viewing direction.
+// Writes the gradients of the SH coefficients above degree 0; returns that of the mean, through the viewing direction.
 vec3 sh_backward(uint i, vec3 offset, vec3 d_color) {
     float small, distance;
     vec3 direction = direction_of(offset, small, distance);
@@ -95,15 +95,10 @@ vec3 sh_backward(uint i, vec3 offset, vec3 d_color) {
     vec3 basis_gradient[16];
     sh_basis(sh_degree, direction, basis);
     sh_basis_gradient(sh_degree, direction, basis_gradient);
-    if (is_trained(DC_COLUMN)) STORE_VEC3(DC_COLUMN, i, basis[0] * d_color);
     vec3 d_direction = vec3(0.0);
     for (uint k = 1; k < sh_count(SH_DEGREE); k++) {
         d_direction += dot(rest_coefficient(i, k), d_color) * basis_gradient[k];
-        if (COLOR_GRADIENTS) continue;
         for (uint c = 0; c < 3; c++) gradients[rest_gradient(i, 3 * (k - 1) + c)] = basis[k] * d_color[c];
-    }
-    if (COLOR_GRADIENTS) {
-        for (uint c = 0; c < written_rest(); c++) gradients[rest_gradient(i, c)] = d_color[c];
     }
     return small * ((d_direction - direction * dot(direction, d_direction)) / distance);
 }
@@ -200,9 +195,14 @@ void main() {
         }
         d_mean_in_view += d_log_factor * lamp_point_gradient(loaded, at);
     }
-    vec3 offset = offset_from_camera(mean, camera.view_from_world);
-    vec3 d_mean = world_from_view * d_mean_in_view + sh_backward(i, offset, d_color);
+    vec3 d_mean = world_from_view * d_mean_in_view;
+    if (COLOR_GRADIENTS) {
+        for (uint c = 0; c < written_rest(); c++) gradients[rest_gradient(i, c)] = d_color[c];
+    } else {
+        d_mean += sh_backward(i, offset_from_camera(mean, camera.view_from_world), d_color);
+    }
 
+    if (is_trained(DC_COLUMN)) STORE_VEC3(DC_COLUMN, i, SH_C0 * d_color);
     if (is_trained(MEANS_COLUMN)) STORE_VEC3(MEANS_COLUMN, i, d_mean);
     if (is_trained(QUATS_COLUMN)) STORE_VEC4(QUATS_COLUMN, i, d_quat);
     if (is_trained(LOG_SCALES_COLUMN)) STORE_VEC3(LOG_SCALES_COLUMN, i, d.log_scale);

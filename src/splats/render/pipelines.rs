@@ -30,7 +30,8 @@ impl Renderer {
     }
 
     /// [`Renderer::new`] whose backward pass writes such gradients, but not those of the first `frozen_columns`.
-    pub(crate) fn with_gradients(
+    #[doc(hidden)]
+    pub fn with_gradients(
         gpu: &Gpu,
         settings: RenderSettings,
         gradients: GradientKind,
