@@ -20,7 +20,7 @@
 #         bench-*.json      512 steps as training submits them, in 32 and 16 bits: small, many, 4 million, and a trained
 #                           model; that of many with the device's ceilings
 #         pipelines.jsonl   registers, spills and shared memory of every kernel, by the driver
-#         ab-*.json         steps with prototypes in place of kernels, and with none, in turn
+#         ab-*.json         steps of the program and of BASELINE, in turn, in 32 and 16 bits
 #         lita-*.jsonl      steps of LITA in single and half precision, with and without crops, and its pipelines
 #         tune*.json        every tile and sort, of the trained model, the synthetic scene, and with subgroups of N lanes
 #         checked.json      every pass against its reference: errors in units of their bounds
@@ -31,11 +31,8 @@
 #         lom.txt           training by the paper's protocol, plain and with every part: scores, or the last steps
 #         growth.txt        how time and memory grow
 #
-# Variables. pack: PROFILE=release, TESTS (the test targets; all; none), and NIGHTSPLAT_PROTOTYPES, a folder of kernels
-# to compare with those of the program: blend_forward.comp and blend_backward.comp, with the interfaces of those,
-# subst.py, which fits them to the modules of a run, and ../wrap.c, a driver around the real one that replaces modules by
-# hash; PROTOTYPE_FLAGS, for glslangValidator. run: ONLY, the experiments by the names of their functions (all); DRIVER, the
-# library of the real driver, if it is not NVIDIA's; GSPLAT.
+# Variables. pack: PROFILE=release, TESTS (the test targets; all; none), and BASELINE, the program of an earlier commit to
+# compare steps with. run: ONLY, the experiments by the names of their functions (all); GSPLAT.
 set -euo pipefail
 
 # A machine may take 64 MiB with the checkout.
@@ -52,19 +49,6 @@ fail() {
 # The executables in cargo's messages, of the targets whose line matches the pattern.
 executables() {
     sed -n "/$1/"'s|.*"executable":"\([^"]*\)".*|\1|p'
-}
-
-# pack_prototypes FROM TO: compiles them; they are fitted to the device where that is.
-pack_prototypes() {
-    local from=$1 to=$2 include=(-Ishaders-glsl/include "-I$1")
-    mkdir -p "$to"
-    cc -O1 -shared -fPIC -o "$to/wrap.so" "$from/../wrap.c" -ldl -lpthread
-    # shellcheck disable=SC2086
-    kernel() { glslangValidator -V --target-env spirv1.5 "${include[@]}" ${PROTOTYPE_FLAGS:-} "$@" > /dev/null; }
-    kernel "$from/blend_forward.comp" -o "$to/forward.spv"
-    kernel "$from/blend_backward.comp" -o "$to/backward.spv"
-    kernel -DBUTTERFLY "$from/blend_backward.comp" -o "$to/butterfly.spv"
-    cp "$from/subst.py" "$(command -v spirv-opt)" "$to"
 }
 
 pack() {
@@ -105,7 +89,7 @@ pack() {
         if [ -e "$(dirname "$loader")/$library" ]; then cp -L "$(dirname "$loader")/$library" "$stage/x11/"; fi
     done
 
-    [ -z "${NIGHTSPLAT_PROTOTYPES:-}" ] || pack_prototypes "$NIGHTSPLAT_PROTOTYPES" "$stage/prototypes"
+    [ -z "${BASELINE:-}" ] || strip -o "$stage/baseline" "$BASELINE"
     git ls-files -z | tar --null -T - -c | tar -x -C "$stage/source"
     # The benchmark's preset recognises a scene by the name of its folder.
     cp -RL "$scene" "$stage/scene/"
@@ -304,61 +288,25 @@ baseline() {
     NIGHTSPLAT_STATISTICS=$found/pipelines.jsonl step pipelines pipelines.txt 30 "$nightsplat" bench --unchecked $MANY
 }
 
-# The library of the driver in use.
-driver() {
-    local kind=nvidia manifest path
-    [ -z "$software" ] || kind=lvp
-    for manifest in ${VK_DRIVER_FILES:-${VK_ICD_FILENAMES:-}} {/etc,/usr/share}/vulkan/icd.d/*"$kind"*.json; do
-        [ -e "$manifest" ] || continue
-        path=$(sed -n 's/.*"library_path": *"\([^"]*\)".*/\1/p' "$manifest")
-        [[ $path != */* || $path == /* ]] || path=$(dirname "$manifest")/$path
-        echo "$path"
-        return
-    done
-}
-
-# Kernels of others in place of those of the program, which is not changed: sets in turn, with none in between. A tile
-# that four subgroups share, in small views, keeps its backward kernel.
-prototypes() {
-    local own=$work/prototypes sets=$work/sets set size round name seen
-    if [ ! -e "$own/wrap.so" ]; then
-        say prototypes 'none packed' 0
-        return
-    elif ! command -v python3 > /dev/null; then
-        say prototypes 'no python3' 0
+# Steps of an earlier program and of this one, in turn.
+compared_with_baseline() {
+    local size round bits program name
+    if [ ! -e "$work/baseline" ]; then
+        say 'no BASELINE' packed 0
         return
     fi
-    printf '{"file_format_version": "1.0.0", "ICD": {"library_path": "%s", "api_version": "1.3.0"}}\n' "$own/wrap.so" \
-        > "$own/wrap.json"
-    local -x WRAP_REAL=1 WRAP_ICD=${DRIVER:-$(driver)} VK_DRIVER_FILES=$own/wrap.json VK_ICD_FILENAMES=$own/wrap.json
     local -A sizes=([many]=$MANY [small]=$SMALL)
-    mkdir -p "$sets"/{modules,none,both}
-    for size in many small; do
-        WRAP_OUT=$sets/modules step "modules-$size" prototypes.txt 20 \
-            "$nightsplat" bench --unchecked --repeats 1 ${sizes[$size]} || return
-    done
-    for set in forward backward butterfly; do
-        ONE_SUBGROUP=$([ $set = forward ] || echo 1) PATH=$PATH:$own step "fit-$set" prototypes.txt 10 \
-            python3 "$own/subst.py" "$sets/modules" "$sets/$set" "$own/$set.spv" || return
-    done
-    cp "$sets"/{forward,backward}/*.spv "$sets/both"
     for ((round = 1; round <= ROUNDS; round++)); do
         for size in many small; do
-            for set in none forward backward both butterfly; do
-                name=ab-$size-$set-$round seen=$(wc -l < "$out/log.txt")
-                WRAP_SUBST=$sets/$set step "$name" "$name.json" 15 "$nightsplat" bench --unchecked --json \
-                    --warm $((warm / 2)) --repeats "$REPEATS" --steady $((STEPS / 2)) ${sizes[$size]} || continue
-                note "$(tail -n "+$seen" "$out/log.txt" | grep -c replaced || true) replaced; step, ms:" \
-                    "$(members "$name.json" steady | sed -n 's/device_ms//p');" \
-                    "$(members "$name.json" kernels | grep ^blend_ | tr '\n' ' ')"
+            for bits in 32 16; do
+                for program in baseline nightsplat; do
+                    name=ab-$size-$bits-$program-$round
+                    step "$name" "$name.json" 15 "$work/$program" bench --unchecked --json --warm $((warm / 2)) \
+                        --repeats "$REPEATS" --steady $((STEPS / 2)) --precision $bits ${sizes[$size]} || continue
+                    note "step, ms: $(members "$name.json" steady | sed -n 's/device_ms//p');" \
+                        "$(members "$name.json" kernels | head -n 6 | awk '{ printf "%s %.3f  ", $1, $2 }')"
+                done
             done
-        done
-        [ "$round" = 1 ] || continue
-        # What they compute.
-        for set in both butterfly; do
-            WRAP_SUBST=$sets/$set step "ab-checked-$set" "ab-checked-$set.json" 30 \
-                "$nightsplat" bench --json --repeats 1 $LARGE || true
-            note "error / bound: $(members "ab-checked-$set.json" errors | grep ^blend_ | tr '\n' ' ')"
         done
     done
 }
@@ -444,12 +392,12 @@ run() {
         software=yes patience=10 warm=0
         shift
         local little='--gaussians 300 --width 64 --height 48'
-        MANY=$little SMALL=$little LARGE=$little MOST=$little TUNE=$little CHECKED=$little
+        MANY=$little SMALL=$little MOST=$little TUNE=$little CHECKED=$little
         TRAINED='--width 64 --height 48' STEPS=2 EQUAL=5 ROUNDS=1 REPEATS=1 CEILINGS=
         PHASES='--downscale 8 --steps 10' LITA='--downscale 8 --steps 3' LOM='--steps 5 --downscale 8'
     fi
     : "${MANY=--gaussians 1000000 --width 1920 --height 1080}" "${SMALL=--gaussians 50000 --width 500 --height 375}"
-    : "${LARGE=--gaussians 20000 --width 1280 --height 1024}" "${MOST=--gaussians 4000000 --width 1920 --height 1080}"
+    : "${MOST=--gaussians 4000000 --width 1920 --height 1080}"
     : "${TUNE=--gaussians 100000}" "${TRAINED=--width 500 --height 375}" "${LITA=--steps 60}"
     : "${STEPS=512}" "${EQUAL=300}" "${ROUNDS=3}" "${REPEATS=9}" "${CEILINGS=--ceilings}"
     end=$((SECONDS + ${2:-570} * patience)) until=$((SECONDS + 60 * patience)) is_late=
@@ -480,7 +428,7 @@ run() {
     # What counts most comes first: times, without checks. Not here, for want of settings: the lengths of segments.
     experiment 60 phases
     experiment 120 baseline
-    experiment 150 prototypes
+    experiment 150 compared_with_baseline
     experiment 50 four_million
     experiment 80 trained_tiles
     experiment 120 lita
@@ -499,19 +447,9 @@ rehearse() {
     dir=$(mktemp -d)
     # shellcheck disable=SC2064
     trap "rm -rf '$dir'" EXIT
-    if [ -n "${NIGHTSPLAT_PROTOTYPES:-}" ]; then
-        # What lavapipe of Mesa 22.3 takes.
-        cp -r "$NIGHTSPLAT_PROTOTYPES" "$dir/prototypes"
-        cp "$NIGHTSPLAT_PROTOTYPES/../wrap.c" "$dir"
-        chmod -R u+w "$dir"
-        sed 's/local_size_x_id = 100, local_size_y_id = 9/local_size_x = 8/' shaders-glsl/include/tile.glsl \
-            > "$dir/prototypes/tile.glsl"
-        sed -i 's/ \[\[subgroup_uniform_control_flow\]\]//; /GL_EXT_subgroup_uniform/d' "$dir"/prototypes/*.comp
-        export NIGHTSPLAT_PROTOTYPES=$dir/prototypes PROTOTYPE_FLAGS=-DOLD_LAVAPIPE
-    fi
-    cargo build --bin nightsplat
+    cargo build --bin nightsplat --example growth
     "${CARGO_TARGET_DIR:-target}/debug/nightsplat" synth "$dir/chair" --views 9 --width 256 --height 192 > /dev/null
-    PRESET=0 PROFILE=dev TESTS=house "$0" pack "$dir/pack" "$dir/chair"
+    BASELINE=${CARGO_TARGET_DIR:-target}/debug/nightsplat PRESET=0 PROFILE=dev TESTS=house "$0" pack "$dir/pack" "$dir/chair"
     "$dir/pack/run.sh" --software "$dir/out"
     ! grep -E 'failed|out of time|no time left' "$dir/out/summary.txt" || status=1
     tar -tzf "$dir/out/results.tar.gz" | sort
