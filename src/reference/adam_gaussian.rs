@@ -55,9 +55,12 @@ fn rounded_by_chance(x: f32, chance: u32) -> u16 {
     nearest(((x / unit + share).floor() * unit).clamp(-largest, largest))
 }
 
-/// The distance of neighbouring numbers of `bits` after the binary point; no number is between 0 and the smallest.
-fn unit(x: f64, bits: i32, smallest: f64) -> f64 {
-    if x.abs() < smallest { smallest } else { (x.abs().log2().floor() - f64::from(bits)).exp2() }
+/// The largest distance of neighbouring numbers of `bits` after the binary point within `bound` of `x`; no number is
+/// between 0 and the smallest.
+fn unit((x, bound): (f64, f64), bits: i32, smallest: f64) -> f64 {
+    let at =
+        |x: f64| if x < smallest { smallest } else { (x.log2().floor() - f64::from(bits)).exp2() };
+    at(x.abs() + bound).max(at(x.abs() - bound))
 }
 
 /// A number that a step updates.
@@ -264,13 +267,13 @@ impl Reference for Kernel {
             match update.shift {
                 None => parameters[update.at] = p.1,
                 Some(shift) => {
-                    let unit = unit(p.0.abs() + p.1, 10, SMALLEST_HALF);
+                    let unit = unit(p, 10, SMALLEST_HALF);
                     coefficients[update.at - halves][shift as usize / 16] = p.1 + unit;
                 }
             }
             let moment = |(value, bound): (f64, f64)| match constants.half_moments {
                 true if update.error == 0.0 => 0.0,
-                true => bound + unit(value.abs() + bound, 7, f32::MIN_POSITIVE.into()),
+                true => bound + unit((value, bound), 7, f32::MIN_POSITIVE.into()),
                 false => bound,
             };
             (first[update.place], second[update.place]) = (moment(m), moment(v));
