@@ -22,7 +22,7 @@
 #         pipelines.jsonl   registers, spills and shared memory of every kernel, by the driver
 #         ab-*.json         steps of the program and of BASELINE, in turn, in 32 and 16 bits
 #         lita-*.jsonl      steps of LITA in single and half precision, with and without crops, and its pipelines
-#         tune*.json        every tile and sort, of the trained model, the synthetic scene, and with subgroups of N lanes
+#         tune*.json        every tile and sort: the trained model, the synthetic scene, and subgroups of N lanes
 #         checked.json      every pass against its reference: errors in units of their bounds
 #         hashes.txt        the models of equal runs, of one without push descriptors, and of one in other batches
 #         validation.txt    messages of the validation layer over two steps
@@ -31,8 +31,8 @@
 #         lom.txt           training by the paper's protocol, plain and with every part: scores, or the last steps
 #         growth.txt        how time and memory grow
 #
-# Variables. pack: PROFILE=release, TESTS (the test targets; all; none), and BASELINE, the program of an earlier commit to
-# compare steps with. run: ONLY, the experiments by the names of their functions (all); GSPLAT.
+# Variables. pack: PROFILE=release, TESTS (the test targets; all; none), and BASELINE, the program of an earlier commit,
+# to compare steps with. run: ONLY, the experiments by the names of their functions (all); GSPLAT.
 set -euo pipefail
 
 # A machine may take 64 MiB with the checkout.
@@ -449,7 +449,8 @@ rehearse() {
     trap "rm -rf '$dir'" EXIT
     cargo build --bin nightsplat --example growth
     "${CARGO_TARGET_DIR:-target}/debug/nightsplat" synth "$dir/chair" --views 9 --width 256 --height 192 > /dev/null
-    BASELINE=${CARGO_TARGET_DIR:-target}/debug/nightsplat PRESET=0 PROFILE=dev TESTS=house "$0" pack "$dir/pack" "$dir/chair"
+    export BASELINE=${CARGO_TARGET_DIR:-target}/debug/nightsplat
+    PRESET=0 PROFILE=dev TESTS=house "$0" pack "$dir/pack" "$dir/chair"
     "$dir/pack/run.sh" --software "$dir/out"
     ! grep -E 'failed|out of time|no time left' "$dir/out/summary.txt" || status=1
     tar -tzf "$dir/out/results.tar.gz" | sort

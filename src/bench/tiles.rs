@@ -97,8 +97,8 @@ impl TileTimings {
     }
 }
 
-/// The tile and the sort with the least sum over sizes of its time relative to the fastest at that size. One whose kernels spill is
-/// taken only where all do: the timed scene leaves caches to spills that a larger one does not.
+/// The tile and the sort with the least sum over sizes of their time relative to the fastest at that size. A tile whose
+/// kernels spill is taken only where all do: the timed scene leaves caches to spills that a larger one does not.
 fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
     let cases = || cases.iter().filter(|case| case.channels == channels);
     let choices = cases().next()?.tiles.iter().map(TileTiming::choice);

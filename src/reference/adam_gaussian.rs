@@ -234,15 +234,16 @@ impl Reference for Kernel {
             let (before, rates) = inputs.before(&update, &slices);
             let [p, m, v] = bounded(update.plane, stepped::<f64>(rates, before));
             let (moments, chance) = moments_after(params.step, before);
-            let (word, place) = (&mut slices.parameters[update.at], update.place);
+            let (word, moment) = (&mut slices.parameters[update.at], update.place);
             *word = update.shift.map_or(p as f32, |shift| {
                 let half = u32::from(rounded_by_chance(p as f32, chance));
                 f32::from_bits(word.to_bits() & !(0xffff << shift) | half << shift)
             });
             if constants.half_moments {
-                slices.both_moments[place] = in_halves(moments, chance);
+                slices.both_moments[moment] = in_halves(moments, chance);
             } else {
-                (slices.first_moments[place], slices.second_moments[place]) = (m as f32, v as f32);
+                (slices.first_moments[moment], slices.second_moments[moment]) =
+                    (m as f32, v as f32);
             }
         }
     }

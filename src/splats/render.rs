@@ -1,8 +1,8 @@
 //! The differentiable rasteriser: Gaussians and a camera to a render, and the gradient of the render to theirs.
 //!
 //! ```text
-//! project -> sort by depth -> order_counts -> emit -> sort by tile -> blend_forward      as a whole
-//! project -> order_counts -> emit -> places in tiles -> sort of each tile -> blend_forward, which a device may do faster
+//! project -> sort by depth -> order_counts -> emit -> sort by tile -> blend_forward         as a whole
+//! project -> order_counts -> emit -> places in tiles -> sort of each tile -> blend_forward    tile by tile
 //!     -> [loss] -> blend_backward -> project_backward
 //! ```
 //!

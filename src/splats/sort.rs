@@ -1,11 +1,11 @@
 //! Exclusive scan and stable radix sort of arrays whose length is on the device, and the sort of each tile by itself.
 //!
-//! The first two are reduce-then-scan: an upsweep sums partitions of consecutive items, the last of its workgroups scans the
-//! sums, and a downsweep finishes within the partitions. A decoupled look-back would need one kernel instead of two,
-//! but also forward-progress guarantees that Vulkan does not provide. One subgroup owns a partition, and results are
-//! bit-identical on every device and in every run. A dispatch has a subgroup for every partition of the buffers'
-//! capacity; those beyond the count return at once. On a GPU, the passes of a sort after the first have no upsweep of
-//! their own.
+//! The first two are reduce-then-scan: an upsweep sums partitions of consecutive items, the last of its workgroups
+//! scans the sums, and a downsweep finishes within the partitions. A decoupled look-back would need one kernel
+//! instead of two, but also forward-progress guarantees that Vulkan does not provide. One subgroup owns a partition,
+//! and results are bit-identical on every device and in every run. A dispatch has a subgroup for every partition of
+//! the buffers' capacity; those beyond the count return at once. On a GPU, the passes of a sort after the first have
+//! no upsweep of their own.
 
 mod radix;
 mod scan;

@@ -1,5 +1,5 @@
-//! The clock of a run: the steps done, and what is due after a step by the schedule and by the decisions of the held-out
-//! views.
+//! The clock of a run: the steps done, and what is due after a step by the schedule and by the decisions of the
+//! held-out views.
 //!
 //! ```text
 //! growth -> converged, or the last steps begin -> cooldown: no density control, learning rates decay -> end
@@ -21,7 +21,7 @@ const SETTLING_DISTANCE: u64 = 50;
 
 /// The steps of a run and its decisions; all else is a function of them.
 #[derive(Debug)]
-pub(super) struct Clock {
+pub(super) struct RunClock {
     config: Arc<TrainConfig>,
     /// Steps done.
     pub(super) step: u64,
@@ -31,7 +31,7 @@ pub(super) struct Clock {
     pub(super) submissions: Submissions,
 }
 
-impl Clock {
+impl RunClock {
     /// The clock before the first step.
     pub(super) fn new(config: Arc<TrainConfig>, has_held_out: bool) -> Self {
         let (decisions, submissions) = (Decisions::default(), Submissions::default());

@@ -9,7 +9,7 @@ use nightsplat_core::camera::{Camera, Patch};
 use nightsplat_core::random::Stream;
 use nightsplat_photographs::image::Image;
 
-use super::clock::Clock;
+use super::clock::RunClock;
 use super::config::TrainConfig;
 use super::gaussians::TrainedGaussians;
 use super::model::TrainedModel;
@@ -60,7 +60,7 @@ pub(super) fn seeded_count(config: &TrainConfig, views: &Views) -> usize {
 /// The number of Gaussians, of which there are `count`, after a seeding that is still to come.
 pub(super) fn count_once_seeded(
     config: &TrainConfig,
-    clock: &Clock,
+    clock: &RunClock,
     views: &Views,
     count: usize,
 ) -> usize {

@@ -9,7 +9,7 @@ use nightsplat_core::camera::Patch;
 use serde::Serialize;
 
 use super::cache::CacheSize;
-use super::clock::Clock;
+use super::clock::RunClock;
 use super::config::TrainConfig;
 use super::depth_seeding::count_once_seeded;
 use super::model::{MARGIN, TrainedModel};
@@ -71,7 +71,7 @@ impl Memory {
     pub(super) fn estimate(
         &self,
         model: &mut TrainedModel,
-        clock: &Clock,
+        clock: &RunClock,
         views: &Views,
     ) -> Result<MemoryEstimate> {
         let met = f64::from(intersections_of_largest_view(model, views)?);
@@ -107,7 +107,7 @@ impl Memory {
     fn peak_gaussians(
         &self,
         model: &TrainedModel,
-        clock: &Clock,
+        clock: &RunClock,
         views: &Views,
         met: f64,
     ) -> usize {
@@ -130,7 +130,7 @@ impl Memory {
     pub(super) fn capacity(
         &self,
         model: &TrainedModel,
-        clock: &Clock,
+        clock: &RunClock,
         met: f64,
     ) -> (usize, &'static str) {
         let count = model.count();
@@ -154,14 +154,14 @@ impl Memory {
     }
 
     /// The number of Gaussians, with `each` intersections, that fits the device's limit.
-    fn fitting_in_vram(&self, model: &TrainedModel, clock: &Clock, each: f64) -> usize {
+    fn fitting_in_vram(&self, model: &TrainedModel, clock: &RunClock, each: f64) -> usize {
         let Some(CacheSize(limit)) = self.config.max_vram else { return usize::MAX };
         let beside = intersection_bytes(model, each);
         self.per_gaussian(model, clock).fitting(limit as f64 - self.fixed_bytes, model, beside)
     }
 
     /// The number of Gaussians that fits the host's limit: as copies and, on a software device, as device buffers.
-    fn fitting_in_ram(&self, model: &TrainedModel, clock: &Clock, each: f64) -> usize {
+    fn fitting_in_ram(&self, model: &TrainedModel, clock: &RunClock, each: f64) -> usize {
         let Some(CacheSize(limit)) = self.config.max_ram else { return usize::MAX };
         let copies = HOST_PLANE_SETS * self.host_plane(model);
         let rest = limit as f64 - PROGRAM;
@@ -174,7 +174,7 @@ impl Memory {
     }
 
     /// Bytes per Gaussian once the highest SH degree is in use.
-    fn per_gaussian(&self, model: &TrainedModel, clock: &Clock) -> PerGaussian {
+    fn per_gaussian(&self, model: &TrainedModel, clock: &RunClock) -> PerGaussian {
         let now = model.gaussians.shape();
         let sh_degree = clock.sh_degree(self.config.steps).max(now.sh_degree);
         PerGaussian::new(&self.config, model, Shape { sh_degree, ..now })

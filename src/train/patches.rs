@@ -34,8 +34,8 @@ impl TrainConfig {
 }
 
 impl Views {
-    /// A smaller patch size if the first Gaussians of the model have too many intersections with the present one; `None`
-    /// otherwise, or if smaller patches do not help.
+    /// A smaller patch size if the first Gaussians of the model have too many intersections with the present one;
+    /// `None` otherwise, or if smaller patches do not help.
     pub(super) fn fewer_patch_pixels(&self, model: &mut TrainedModel) -> Result<Option<u64>> {
         let of_photograph = |patch: &Patch| Patch::from(&patch.camera).pixel_count();
         let patches = || self.whole().iter().map(|view| (view.photograph, view.patch));

@@ -11,7 +11,7 @@ use nightsplat_photographs::scene_tone::SceneTone;
 
 use super::batching::MAX_STEPS;
 use super::cache::CacheSize;
-use super::clock::Clock;
+use super::clock::RunClock;
 use super::config::TrainConfig;
 use super::context::Initial;
 use super::gaussians::TrainedGaussians;
@@ -23,7 +23,7 @@ use super::passes::{TrainKernels, first_sh_degree};
 use super::supervision::Supervision;
 use super::target_views::TargetViews;
 use super::terms::NetworkTerms;
-use super::trainer::{Scene, Trainer};
+use super::trainer::{TrainedScene, Trainer};
 use super::views::Views;
 use crate::gpu::Gpu;
 use crate::loss::exposure::Exposures;
@@ -232,9 +232,9 @@ impl Trainer {
         let config = Arc::new(config);
         Ok(Self {
             gpu: gpu.clone(),
-            scene: Scene { fingerprint, frame, extent, law },
+            scene: TrainedScene { fingerprint, frame, extent, law },
             memory: Memory::new(gpu, Arc::clone(&config), &model),
-            clock: Clock::new(Arc::clone(&config), !supervision.held_out.is_empty()),
+            clock: RunClock::new(Arc::clone(&config), !supervision.held_out.is_empty()),
             supervision,
             model,
             config,

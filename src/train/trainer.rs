@@ -7,7 +7,7 @@ use nightsplat_photographs::dataset::{Dataset, Fingerprint};
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::SceneLaw;
 
-use super::clock::Clock;
+use super::clock::RunClock;
 use super::config::TrainConfig;
 use super::context::Initial;
 use super::memory::{Memory, MemoryEstimate};
@@ -73,16 +73,16 @@ impl StepReport {
 pub struct Trainer {
     pub(super) gpu: Gpu,
     pub(super) config: Arc<TrainConfig>,
-    pub(super) scene: Scene,
+    pub(super) scene: TrainedScene,
     pub(super) supervision: Supervision,
     pub(super) model: TrainedModel,
-    pub(super) clock: Clock,
+    pub(super) clock: RunClock,
     pub(super) memory: Memory,
 }
 
 /// What a training knows of its dataset.
 #[derive(Debug)]
-pub(super) struct Scene {
+pub(super) struct TrainedScene {
     pub(super) fingerprint: Fingerprint,
     /// The frame of all coordinates on the device.
     pub(super) frame: TrainingFrame,
@@ -186,7 +186,7 @@ impl Trainer {
 
     /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world.
     pub(crate) fn model_of(&self, in_frame: &Gaussians) -> splats::model::Model {
-        let Scene { frame, law, .. } = &self.scene;
+        let TrainedScene { frame, law, .. } = &self.scene;
         let facts = ModelFacts { law: *law, ..self.config.facts(frame) };
         splats::model::Model::new(in_frame.to_world(frame), &facts)
     }

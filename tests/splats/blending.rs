@@ -91,7 +91,7 @@ impl Tiles {
 
     fn states(&self, segment: u32) -> usize {
         let [width, height] = self.tile.size;
-        let blocks = if segment == 0 { 0 } else { self.count() as u32 / segment + 1 };
+        let blocks = (self.count() as u32).checked_div(segment).map_or(0, |blocks| blocks + 1);
         (blocks * (self.channels + 1) * width * height).max(1) as usize
     }
 
@@ -162,7 +162,7 @@ impl Tiles {
             ..Default::default()
         };
         let tile_count = self.tile_count();
-        let blocks = if segment == 0 { 0 } else { self.count() as u32 / segment + 1 };
+        let blocks = (self.count() as u32).checked_div(segment).map_or(0, |blocks| blocks + 1);
         run_kernel!(
             blend_backward,
             constants,
@@ -374,7 +374,7 @@ fn assert_none_is_missed(tiles: &Tiles) -> [usize; 2] {
             let (mut is_visible, mut is_blended) = (false, false);
             for pixel in (0..width).map(|x| origin + UVec2::new(x, y)) {
                 let sigma = splat.sigma(splat.mean2d - pixel.as_dvec2() - 0.5);
-                let shows = sigma >= 0.0 && splat.opacity * (-sigma).exp() >= f64::from(ALPHA_MIN);
+                let shows = sigma >= 0.0 && splat.opacity * (-sigma).exp() >= ALPHA_MIN;
                 let blends = blended[(pixel.y * tiles.size.x + pixel.x) as usize];
                 assert!(blends || !shows, "{}: {pixel} of {projected:?}", tiles.tile);
                 is_visible |= shows;

@@ -341,8 +341,8 @@ fn compare_sort_kernels(rank_by_ballot: bool, subgroups: u32) {
 // ---------------------------------------------------------------------------
 // Tiles
 
-/// Intersections of tiles of these sizes, by slot in no order, and the depths of their Gaussians; `padding` slots belong
-/// to no tile.
+/// Intersections of tiles of these sizes, by slot in no order, and the depths of their Gaussians; `padding` slots
+/// belong to no tile.
 struct Intersections {
     tiles: Vec<u32>,
     places: Vec<u32>,
@@ -406,6 +406,8 @@ fn assert_sorts_tiles(gpu: &Gpu, sort: &mut TileSort, what: &str, sizes: &[u32],
     });
     done.unwrap();
     report.agree().unwrap();
+    let kernels: Vec<_> = report.passes.iter().map(|pass| pass.kernel).collect();
+    assert_eq!(kernels, ["tile_begins", "place_pairs", "sort_tiles"]);
     let what = format!("{what}, tiles of {sizes:?}");
     let (expected_tiles, expected_slots) = given.sorted();
     let (sorted_tiles, slots) = (gpu.read(&tiles).unwrap(), gpu.read(&intersection_ids).unwrap());

@@ -9,9 +9,9 @@
 //! Emit: one lane per rank writes the tiles of its Gaussian into the slots reserved for it.
 //!
 //! Where ranks and so slots are in the order of depth, a stable sort by tile leaves every tile's intersections front to
-//! back. Where each tile is sorted by itself, ranks are in the order of the Gaussians, and every slot gets a place in its
-//! tile in the order of arrival. A Gaussian's slots are contiguous: the backward pass sums over them. The lanes share
-//! those of a Gaussian that has many.
+//! back. Where each tile is sorted by itself, ranks are in the order of the Gaussians, and every slot gets a place in
+//! its tile in the order of arrival. A Gaussian's slots are contiguous: the backward pass sums over them. The lanes
+//! share those of a Gaussian that has many.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

@@ -8,8 +8,8 @@
 //!
 //! A pair (depth key, slot) is unique, so the result does not depend on the order of arrival. The network is Batcher's
 //! bitonic one with ascending exchanges alone: what would lie beyond the last pair counts as larger than any, and never
-//! moves, so any number of pairs is sorted in place. Pairs are in shared memory, CAPACITY at a time; exchanges that reach
-//! farther, of tiles with more, are in memory.
+//! moves, so any number of pairs is sorted in place. Pairs are in shared memory, CAPACITY at a time; exchanges that
+//! reach farther, of tiles with more, are in memory.
 //!
 //! The workgroup after the last tile fills what belongs to no tile.
 

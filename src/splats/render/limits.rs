@@ -16,8 +16,8 @@ pub(super) fn splats_per_turn(gpu: &Gpu) -> u32 {
 
 /// 1 where the backward pass sums gradient records over the lanes in shared memory, 0 where by shuffles.
 ///
-/// A record of three channels takes 12 shuffles. On NVIDIA each is an instruction of the units for loads, and a lane that
-/// sums a value of its own takes a third fewer instructions. AMD and Intel read another lane's register within an
+/// A record of three channels takes 12 shuffles. On NVIDIA each is an instruction of the units for loads, and a lane
+/// that sums a value of its own takes a third fewer instructions. AMD and Intel read another lane's register within an
 /// addition, and on AMD the memory would leave room for a third of the subgroups. A CPU has its splats in registers.
 pub(super) fn sums_in_shared_memory(device: &Properties) -> u32 {
     const NVIDIA: u32 = 0x10de;

@@ -79,8 +79,8 @@ impl TileSort {
         self.pairs.grow(&self.gpu, capacity)
     }
 
-    /// Records the sort of a view of `tile_count` tiles, for which memory was taken, and whose intersections are counted
-    /// in [`Self::sizes`], which become zeros.
+    /// Records the sort of a view of `tile_count` tiles, for which memory was taken. [`Self::sizes`] counts their
+    /// intersections, and becomes zeros.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,
