@@ -219,9 +219,9 @@ impl Trainer {
     ///
     /// # Errors
     /// [`Error::Usage`] if the run has ended, [`Error::NotFinite`] if a loss term or gradient is not finite and
-    /// [`StopConfig::not_finite`] says to stop, [`Error::TileLimit`] if a tile has more splats than the device can
-    /// process, [`Error::Disagrees`] if a checked step differs from its references and [`TrainConfig::check`] says to
-    /// stop, or the device is out of memory or lost.
+    /// [`StopConfig::not_finite`](super::StopConfig::not_finite) says to stop, [`Error::TileLimit`] if a tile has more
+    /// splats than the device can process, [`Error::Disagrees`] if a checked step differs from its references and
+    /// [`TrainConfig::check`] says to stop, or the device is out of memory or lost.
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
         let _phase = tracing::info_span!("steps").entered();
         let step = self.clock.step;

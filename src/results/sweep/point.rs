@@ -39,7 +39,7 @@ const AXES: [(&str, &str); 10] = [
 /// A setting with a list of values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SweepAxis {
-    /// A name of [`AXES`], or the key of any other setting.
+    /// A name of `AXES`, or the key of any other setting.
     pub key: String,
     pub values: Vec<String>,
 }
