@@ -31,7 +31,7 @@ const BUDGET: &[(&str, usize, &str)] = &[
     ("src/train", 10870, "The trainer and its settings; fall-off, lamps; detail of a score."),
     ("src", 710, "Files without a folder: the list of modules, the self-test."),
     ("tests", 30670, "What no unit test of a file can show."),
-    ("shaders-glsl", 6364, "The kernels, with a sort of each tile and staged batches."),
+    ("shaders-glsl", 6374, "The kernels, with a sort of each tile and staged batches."),
     ("scripts", 5322, "Measurements, packages, checks against other programs."),
     ("docs", 2021, "What users and contributors read."),
 ];

@@ -46,8 +46,8 @@ layout(binding = 6) readonly  buffer Cameras       { Camera cameras[]; };
 #include "rest.glsl"
 #include "log_scale.glsl"
 
-// The most coefficients above degree 0, in whole vectors of four.
-const uint MAX_REST = 3 * MAX_COEFFICIENTS;
+// Coefficients above degree 0 are updated four at a time, which has whole vectors: fewer registers than all at once.
+const uint TOGETHER = 12;
 
 // The values after a step with these gradients, of which `count` count; their moments, at these places, are updated.
 // `chance`: random numbers for rounding the values.
@@ -102,16 +102,17 @@ uint coefficient_word(uint i, uint k) {
     return rest_word(REST_COLUMN, HALF_REST ? words_of(rest_width()) : rest_width(), gaussian_count, i, k);
 }
 
-// The coefficients above degree 0, and zeros after them.
-void load_rest(uint i, out float rest[MAX_REST]) {
+// Numbers of the coefficients above degree 0 from `first`, an even one, on, and zeros after the last.
+void load_rest(uint i, uint first, out float rest[TOGETHER]) {
     uint width = rest_width();
-    [[unroll]] for (uint k = 0; k < MAX_REST; k += 2) {
+    [[unroll]] for (uint k = 0; k < TOGETHER; k += 2) {
+        uint at = first + k;
         vec2 pair = vec2(0.0);
         if (HALF_REST) {
-            if (k < width) pair = unpackHalf2x16(floatBitsToUint(parameters[coefficient_word(i, k / 2)]));
+            if (at < width) pair = unpackHalf2x16(floatBitsToUint(parameters[coefficient_word(i, at / 2)]));
         } else {
-            if (k < width) pair.x = parameters[coefficient_word(i, k)];
-            if (k + 1 < width) pair.y = parameters[coefficient_word(i, k + 1)];
+            if (at < width) pair.x = parameters[coefficient_word(i, at)];
+            if (at + 1 < width) pair.y = parameters[coefficient_word(i, at + 1)];
         }
         rest[k] = pair.x;
         rest[k + 1] = pair.y;
@@ -135,32 +136,41 @@ void store_rest(uint i, uint first, vec4 value, uvec4 chance) {
 vec3 update_rest(uint i) {
     Camera camera = cameras[camera_index];
     vec3 offset = offset_from_camera(LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i), camera.view_from_world);
-    float small, distance, basis[16], rest[MAX_REST];
-    vec3 direction = direction_of(offset, small, distance), basis_gradient[16], d_direction = vec3(0.0);
+    float small, distance, basis[16], d_basis[16];
+    vec3 direction = direction_of(offset, small, distance);
     sh_basis(sh_degree, direction, basis);
-    sh_basis_gradient(sh_degree, direction, basis_gradient);
     vec4 d_color = vec4(0.0);
     [[unroll]] for (uint c = 0; c < 3; c++)
         d_color[c] = gradients[trained_place(rest_word(REST_COLUMN, 3, gaussian_count, i, c))];
     d_color = clamp_gradient(d_color);
-    load_rest(i, rest);
-    [[unroll]] for (uint k = 1; k < MAX_COEFFICIENTS; k++) {
-        vec3 coefficient = vec3(rest[3 * k - 3], rest[3 * k - 2], rest[3 * k - 1]);
-        d_direction += dot(coefficient, d_color.rgb) * basis_gradient[k];
-    }
-    [[unroll]] for (uint first = 0; first < MAX_REST; first += 4) {
-        if (first >= rest_width()) break;
-        vec4 value, gradient;
-        uvec4 place, chance;
-        [[unroll]] for (uint k = 0; k < 4; k++) {
-            uint at = first + k;
-            value[k] = rest[at];
-            gradient[k] = at < rest_width() ? basis[min(1 + at / 3, MAX_COEFFICIENTS - 1)] * d_color[at % 3] : 0.0;
-            place[k] = trained_place(rest_word(REST_COLUMN, rest_width(), gaussian_count, i, at));
+    [[unroll]] for (uint k = 0; k < 16; k++) d_basis[k] = 0.0;
+    [[unroll]] for (uint group = 0; group < 3 * MAX_COEFFICIENTS; group += TOGETHER) {
+        if (group >= rest_width()) break;
+        float rest[TOGETHER];
+        load_rest(i, group, rest);
+        [[unroll]] for (uint k = 0; k < TOGETHER / 3; k++) {
+            vec3 coefficient = vec3(rest[3 * k], rest[3 * k + 1], rest[3 * k + 2]);
+            uint index = 1 + group / 3 + k;
+            if (index < 16) d_basis[index] = dot(coefficient, d_color.rgb);
         }
-        value = stepped(value, gradient, rates[PLANE_COUNT - 1], place, min(rest_width() - first, 4), chance);
-        store_rest(i, first, value, chance);
+        [[unroll]] for (uint first = 0; first < TOGETHER; first += 4) {
+            if (group + first >= rest_width()) break;
+            vec4 value, gradient;
+            uvec4 place, chance;
+            [[unroll]] for (uint k = 0; k < 4; k++) {
+                uint at = group + first + k;
+                value[k] = rest[first + k];
+                gradient[k] = at < rest_width() ? basis[min(1 + at / 3, MAX_COEFFICIENTS - 1)] * d_color[at % 3] : 0.0;
+                place[k] = trained_place(rest_word(REST_COLUMN, rest_width(), gaussian_count, i, at));
+            }
+            uint count = min(rest_width() - group - first, 4);
+            value = stepped(value, gradient, rates[PLANE_COUNT - 1], place, count, chance);
+            store_rest(i, group + first, value, chance);
+        }
     }
+    vec3 basis_gradient[16], d_direction = vec3(0.0);
+    sh_basis_gradient(sh_degree, direction, basis_gradient);
+    [[unroll]] for (uint k = 1; k < MAX_COEFFICIENTS; k++) d_direction += d_basis[k] * basis_gradient[k];
     return small * ((d_direction - direction * dot(direction, d_direction)) / distance);
 }
 
