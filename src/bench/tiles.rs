@@ -132,9 +132,8 @@ impl Case {
             tiles.flat_map(|tile| sorts.iter().map(move |&sorting| (tile, sorting))).collect();
         // Compiling takes longer than everything else.
         let compiled = choices.into_par_iter().map(|(tile, sorting)| {
-            let (tile_of, sorting_of) = (Some(tile), Some(sorting));
-            let settings =
-                RenderSettings { tile: tile_of, sorting: sorting_of, ..scene.render_settings() };
+            let defaults = scene.render_settings();
+            let settings = RenderSettings { tile: Some(tile), sorting: Some(sorting), ..defaults };
             let renderer = Renderer::new(gpu, settings)?;
             let resources = renderer.blend_statistics()?;
             let resources = resources

@@ -11,6 +11,7 @@
 //!
 //! Only the costs depend on the speed of the device and on interruptions.
 
+mod arguments;
 mod grid;
 mod options;
 mod run;

@@ -70,7 +70,7 @@ struct Update {
     /// The shift of a coefficient within its word.
     shift: Option<u32>,
     /// The index of its moments.
-    place: usize,
+    moment: usize,
     plane: usize,
     value: f32,
     gradient: f32,
@@ -130,8 +130,8 @@ impl<'a> Inputs<'a> {
     /// The number and its moments before the step, and its rates.
     fn before(&self, update: &Update, slices: &Slices<'_>) -> ([f32; 4], [f32; 2]) {
         let [m, v] = match self.constants.half_moments {
-            true => from_halves(slices.both_moments[update.place]),
-            false => [slices.first_moments[update.place], slices.second_moments[update.place]],
+            true => from_halves(slices.both_moments[update.moment]),
+            false => [slices.first_moments[update.moment], slices.second_moments[update.moment]],
         };
         let rates = [self.params.rates[update.plane], self.params.second_correction];
         ([update.value, update.gradient, m, v], rates)
@@ -147,7 +147,7 @@ impl<'a> Inputs<'a> {
             false => self.indices(i, columns),
         };
         let (by_gaussian, floats) = &self.floats;
-        let (values, places) =
+        let (values, moments) =
             (by_gaussian.indices(i).collect::<Vec<_>>(), self.indices(i, columns));
         let attributes = planes(layout.feature_count, columns);
         let written = self.indices(i, columns.min(before_rest + 3));
@@ -166,7 +166,7 @@ impl<'a> Inputs<'a> {
             Update {
                 at: packed.map_or_else(|| words[column], |k| words[before_rest + k / 2]),
                 shift: packed.map(|k| 16 * (k as u32 % 2)),
-                place: places[column] - left_out,
+                moment: moments[column] - left_out,
                 plane: plane.unwrap_or_default(),
                 value: floats[values[column]],
                 gradient: gradient as f32,
@@ -234,7 +234,7 @@ impl Reference for Kernel {
             let (before, rates) = inputs.before(&update, &slices);
             let [p, m, v] = bounded(update.plane, stepped::<f64>(rates, before));
             let (moments, chance) = moments_after(params.step, before);
-            let (word, moment) = (&mut slices.parameters[update.at], update.place);
+            let (word, moment) = (&mut slices.parameters[update.at], update.moment);
             *word = update.shift.map_or(p as f32, |shift| {
                 let half = u32::from(rounded_by_chance(p as f32, chance));
                 f32::from_bits(word.to_bits() & !(0xffff << shift) | half << shift)
@@ -277,7 +277,7 @@ impl Reference for Kernel {
                 true => bound + unit((value, bound), 7, f32::MIN_POSITIVE.into()),
                 false => bound,
             };
-            (first[update.place], second[update.place]) = (moment(m), moment(v));
+            (first[update.moment], second[update.moment]) = (moment(m), moment(v));
         }
         let parameters =
             Tolerance::Packed { numbers: parameters, format: half, pairs: coefficients };

@@ -228,12 +228,12 @@ impl<'a> BackwardInputs<'a> {
         gradient
     }
 
-    /// Calls `take` with the place of each gradient of Gaussian `i` among the planes of all parameters, and its value.
+    /// Calls `take` with the index of each gradient of Gaussian `i` in the planes of all parameters, and its value.
     fn store(&self, gradient: &Gaussian, i: usize, mut take: impl FnMut(usize, f64)) {
         let Planes { count, feature_count, rest_by_column, .. } = self.planes;
         let columns = self.written_columns();
-        let places = Words { count, feature_count, columns, rest_by_column }.of_gaussian(i);
-        places.zip(gradient.values()).for_each(|(at, value)| take(at, value));
+        let indices = Words { count, feature_count, columns, rest_by_column }.of_gaussian(i);
+        indices.zip(gradient.values()).for_each(|(at, value)| take(at, value));
     }
 
     /// The colour of Gaussian `i` in the forward pass.

@@ -9,6 +9,7 @@
 //! Counts stay on the device. If the intersections of a view exceed the reserved memory, a status flag is set, nothing
 //! is rendered or updated, and the host grows the buffers and repeats the step ([`Renderer::grow`]).
 
+mod bins;
 mod buffers;
 mod cameras;
 mod capacity;
@@ -32,19 +33,18 @@ use std::collections::BTreeMap;
 use glam::{UVec2, Vec2};
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads, Tile};
-use crate::kernels::project::DEPTH_BITS;
 use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
 use crate::splats::batches::GradientKind;
 use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
-use crate::splats::sort::{Count, RadixSort, TileSort, UnsortedTiles};
 use crate::{Error, Result};
 
+use bins::Sort;
 pub use buffers::RenderBuffers;
 pub use buffers::Status;
-use buffers::{RANKS_PER_PARTITION, color_floats};
+use buffers::color_floats;
 pub use cameras::{Viewpoint, Viewpoints};
 pub use draw::Drawn;
 use draw::HostTargets;
@@ -112,15 +112,6 @@ pub struct Renderer {
     host_targets: Option<HostTargets>,
     /// Lights the colours.
     lamp: Option<DeviceLamp>,
-}
-
-/// The sort of the intersections by tile and depth.
-#[derive(Debug)]
-enum Sort {
-    /// All Gaussians by depth, then all intersections by tile.
-    Whole { by_depth: RadixSort, by_tile: RadixSort },
-    /// Each tile by itself.
-    Tiles(TileSort),
 }
 
 /// How the last channel of a render keeps the depth in the view.
@@ -427,77 +418,6 @@ impl Renderer {
             return Ok(());
         };
         Err(Error::Usage(problem))
-    }
-
-    /// From projected splats to the sorted list of each tile, front to back.
-    fn record_bins(
-        &mut self,
-        pass: &mut Recorder<'_>,
-        gaussian_count: u32,
-        view: &KernelView<'_>,
-        capacity: Option<u32>,
-    ) -> Result<()> {
-        let tile_count = view.tile_count();
-        let Self { frame, sort, .. } = self;
-        if let Sort::Whole { by_depth, .. } = sort {
-            let all = Count { counts: &frame.gaussian_counts, index: 0 };
-            by_depth.record(pass, all, &mut frame.depth_keys, &mut frame.ids, DEPTH_BITS)?;
-        }
-        pass.dispatch(
-            &self.order_counts,
-            &order_counts::Params {
-                gaussian_count,
-                capacity: capacity.unwrap_or(frame.intersection_capacity()),
-                truncates: capacity.is_some().into(),
-            },
-            order_counts::Buffers {
-                sorted_ids: frame.ids.slice(),
-                tile_counts: frame.tile_counts.slice(),
-                intersection_offsets: frame.intersection_offsets.slice_mut(),
-                sums: frame.sums.slice_mut(),
-                counts: frame.counts.slice_mut(),
-                status: frame.status.slice_mut(),
-                arrivals: frame.arrivals.slice_mut(),
-            },
-            Threads::Workgroups([gaussian_count.div_ceil(RANKS_PER_PARTITION).max(1), 1, 1]),
-        )?;
-        pass.dispatch(
-            &self.emit,
-            &emit::Params { size: view.size, gaussian_count, tile_columns: view.tiles.x },
-            emit::Buffers {
-                counts: frame.counts.slice(),
-                sorted_ids: frame.ids.slice(),
-                tile_counts: frame.tile_counts.slice(),
-                intersection_offsets: frame.intersection_offsets.slice(),
-                sums: frame.sums.slice(),
-                splats: frame.splats.slice(),
-                tiles: frame.tiles.slice_mut(),
-                intersection_ids: frame.intersection_ids.slice_mut(),
-                gaussian_ids: frame.gaussian_ids.slice_mut(),
-                intersection_ranges: frame.intersection_ranges.slice_mut(),
-                tile_sizes: match sort {
-                    Sort::Whole { .. } => frame.no_sizes.slice_mut(),
-                    Sort::Tiles(tiles) => tiles.sizes.slice_mut(),
-                },
-            },
-            Threads::Exactly([gaussian_count, 1, 1]),
-        )?;
-        let (tiles, intersection_ids) = (&mut frame.tiles, &mut frame.intersection_ids);
-        match sort {
-            Sort::Whole { by_tile, .. } => {
-                let intersections = Count { counts: &frame.counts, index: 0 };
-                // One value more than there are tiles: padding sorts last.
-                let bits = u32::BITS - tile_count.leading_zeros();
-                by_tile.record(pass, intersections, tiles, intersection_ids, bits)
-            }
-            Sort::Tiles(sort) => {
-                let (counts, gaussian_ids) = (&frame.counts, &frame.gaussian_ids);
-                let depth_keys = &frame.depth_keys;
-                let unsorted =
-                    UnsortedTiles { counts, gaussian_ids, depth_keys, tiles, intersection_ids };
-                sort.record(pass, tile_count, unsorted)
-            }
-        }
     }
 
     /// The number of Gaussians that precede those of a view.

@@ -4,6 +4,7 @@ use nightsplat_core::camera::Camera;
 
 use super::decisions::{HeldOutScore, PATIENCE, RecordedRound};
 use super::early_stopping::{EndReason, Ended};
+use super::model::TrainedModel;
 use super::rendered::Rendered;
 use super::supervision::Supervision;
 use super::target_views::TargetViews;
@@ -21,33 +22,19 @@ impl Trainer {
 
     /// [`Trainer::held_out_psnr`] with a given SH degree.
     fn held_out_psnr_of_degree(&mut self, sh_degree: u32) -> Result<Option<f64>> {
-        Ok(self.psnr_of_held_out(sh_degree)?.map(|[colors, _]| colors))
-    }
-
-    /// The mean PSNR, dB, of R_0 and of the output (R_K if the model has a denoiser); `None` if no view is held out.
-    fn psnr_of_held_out(&mut self, sh_degree: u32) -> Result<Option<[f64; 2]>> {
         let affines = self.supervision.affines()?;
-        self.with_held_out(sh_degree, |views, render| views.mean_psnr(&affines, render))
-    }
-
-    /// What `score` makes of the held-out views and their renders.
-    fn with_held_out<T>(
-        &mut self,
-        sh_degree: u32,
-        score: impl FnOnce(&TargetViews, &mut dyn FnMut(&Camera) -> Result<Rendered>) -> Result<T>,
-    ) -> Result<T> {
         let Self { supervision: Supervision { held_out, networks, .. }, model, .. } = self;
-        let mut networks = networks.as_mut().map(|terms| &mut terms.networks);
-        score(held_out, &mut |camera| model.render(camera, sh_degree, networks.as_deref_mut()))
+        let psnr = held_out.mean_psnr(&affines, renders(model, networks, sh_degree))?;
+        Ok(psnr.map(|[colors, _]| colors))
     }
 
     /// Scores the held-out views, keeps the model if it is the best so far, and decides whether the run has converged.
     pub(super) fn score_held_out(&mut self) -> Result<()> {
         let _phase = tracing::info_span!("scoring").entered();
         let (step, affines) = (self.clock.step, self.supervision.affines()?);
-        let scores = self.with_held_out(self.clock.sh_degree(step), |views, render| {
-            views.mean_psnr_and_detail(&affines, render)
-        })?;
+        let Self { supervision: Supervision { held_out, networks, .. }, model, clock, .. } = self;
+        let renders = renders(model, networks, clock.sh_degree(step));
+        let scores = held_out.mean_psnr_and_detail(&affines, renders)?;
         let Some([psnr, detail]) = scores else { return Ok(()) };
         let [score, detail] = [1e3 * psnr, 1e6 * detail].map(|score| score.round() as i64);
         let score = HeldOutScore { step, score, detail };
@@ -145,22 +132,22 @@ impl Trainer {
 
     /// Resets the denoiser to the identity if it hardly improves the held-out views (or, without any, some training
     /// views) over R_0. Called at the end of a run; the paper's denoiser is kept.
-    pub(crate) fn drop_unused_degree(&mut self) -> Result<()> {
+    pub(crate) fn drop_unused_denoiser(&mut self) -> Result<()> {
         /// In dB; on few views, smaller gains are chance.
         const MIN_GAIN: f64 = 0.05;
         if !self.supervision.networks.as_ref().is_some_and(NetworkTerms::follow_target) {
             return Ok(());
         }
-        let Supervision { views, targets, held_out, .. } = &mut self.supervision;
-        let without = held_out.is_empty();
-        if without {
-            *held_out = TargetViews::of_training(views, &targets.pseudo_gt)?;
-        }
-        let scores = self.psnr_of_held_out(self.clock.sh_degree(self.clock.step));
-        if without {
-            self.supervision.held_out = TargetViews::default();
-        }
-        let Some([colors, denoised]) = scores? else { return Ok(()) };
+        let affines = self.supervision.affines()?;
+        let Self { supervision, model, clock, .. } = self;
+        let Supervision { views, targets, held_out, networks, .. } = supervision;
+        let training = match held_out.is_empty() {
+            true => Some(TargetViews::of_training(views, &targets.pseudo_gt)?),
+            false => None,
+        };
+        let renders = renders(model, networks, clock.sh_degree(clock.step));
+        let scores = training.as_ref().unwrap_or(held_out).mean_psnr(&affines, renders)?;
+        let Some([colors, denoised]) = scores else { return Ok(()) };
         let gain = denoised - colors;
         if gain >= MIN_GAIN {
             tracing::info!("the denoiser gains {gain:.2} dB on targets");
@@ -173,4 +160,14 @@ impl Trainer {
             None => Ok(()),
         }
     }
+}
+
+/// Renders of cameras in the training frame, with the networks if the model has any.
+fn renders(
+    model: &mut TrainedModel,
+    networks: &mut Option<NetworkTerms>,
+    sh_degree: u32,
+) -> impl FnMut(&Camera) -> Result<Rendered> {
+    let mut networks = networks.as_mut().map(|terms| &mut terms.networks);
+    move |camera| model.render(camera, sh_degree, networks.as_deref_mut())
 }

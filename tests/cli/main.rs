@@ -322,8 +322,8 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
     assert!(keys(&printed["kernels"]).iter().all(|kernel| errors.contains_key(*kernel)));
     let not_covered = printed["not_covered"].as_array().unwrap().iter();
     let not_covered: Vec<&str> = not_covered.map(|name| name.as_str().unwrap()).collect();
-    // SSIM is one kernel on a CPU and two on a GPU, where Adam updates whole Gaussians also in 32 bits. Tiles are sorted
-    // by themselves where the tuner says so.
+    // SSIM is one kernel on a CPU and two on a GPU, where Adam updates whole Gaussians also in 32 bits. The sort of
+    // each tile runs only where `bench --tune` has chosen it.
     let by_kind = |name: &&str| name.starts_with("ssim") || *name == "adam_gaussian";
     let everywhere = not_covered.iter().copied().filter(|name| !by_kind(name));
     let elsewhere = "\

@@ -108,9 +108,9 @@ fn a_gradient_that_is_not_finite_counts_as_zero() {
         let [mut expected, mut actual] = [(); 2].map(|()| learned(&gpu, 64, formats, 0));
         let mut gradients = gpu.read(&expected.gradients).unwrap();
         // The last three are of colours.
-        let places = [200, 700, 64 * 16, 64 * 18, 64 * 17 + 1];
+        let indices = [200, 700, 64 * 16, 64 * 18, 64 * 17 + 1];
         for (learned, is_wild) in [(&mut expected, false), (&mut actual, true)] {
-            for (&i, value) in places.iter().zip(wild.into_iter().cycle()) {
+            for (&i, value) in indices.iter().zip(wild.into_iter().cycle()) {
                 gradients[i] = if is_wild { value } else { 0.0 };
             }
             gpu.write(&mut learned.gradients, &gradients).unwrap();

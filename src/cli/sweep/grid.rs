@@ -180,6 +180,7 @@ fn product(axes: &[SweepAxis]) -> Vec<Vec<(String, String)>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::sweep::arguments::arguments_of;
     use crate::train::TrainConfig;
     use nightsplat_photographs::tone::ToneCurve;
 
@@ -212,11 +213,11 @@ mod tests {
     fn a_point_is_a_list_of_arguments() {
         let axes = [("curve", "my.toml"), ("beta", "1"), ("steps", "2"), ("seed", "3")];
         let axes = axes.map(|(key, list)| SweepAxis::new(key, list).unwrap());
-        let arguments = points(&axes, None).unwrap()[0].arguments().join(" ");
+        let arguments = arguments_of(&points(&axes, None).unwrap()[0]).join(" ");
         assert_eq!(arguments, "--curve my.toml --set tone.beta=1 --set steps=2 --seed 3");
         let offsets = points(&[SweepAxis::new("offset", "0.1,adaptive").unwrap()], None).unwrap();
-        assert_eq!(offsets[0].arguments().join(" "), "--set tone.alpha=0.1 --set tone.beta=0");
-        assert!(offsets[1].arguments().is_empty());
+        assert_eq!(arguments_of(&offsets[0]).join(" "), "--set tone.alpha=0.1 --set tone.beta=0");
+        assert!(arguments_of(&offsets[1]).is_empty());
     }
 
     #[test]

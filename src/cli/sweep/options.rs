@@ -8,8 +8,8 @@ use clap::parser::ValueSource;
 use clap::{Arg, ArgMatches, Args, Command, Error, FromArgMatches, ValueHint};
 
 use super::GRID;
+use super::arguments::pair;
 use crate::cli::train::TrainOptions;
-use crate::results::sweep::pair;
 
 /// Options of `train` that take a list here: name in `train`, name here, help.
 const LISTS: [(&str, &str, &str); 5] = [

@@ -5,6 +5,7 @@ use std::path::Path;
 
 use clap::Args;
 
+use super::arguments::arguments_of;
 use crate::cli::quoted;
 use crate::cli::train::TrainArgs;
 use crate::results::run;
@@ -38,7 +39,7 @@ impl SweepTraining {
         let folder = out.join(&name);
         let mut arguments = vec!["train".to_owned(), dataset.to_owned()];
         arguments.extend_from_slice(shared);
-        arguments.extend(point.arguments());
+        arguments.extend(arguments_of(&point));
         let end = ["--out".to_owned(), unicode(&folder)?, "--resume".to_owned()];
         let mut args: TrainArgs = parsed(&name, arguments.iter().chain(&end))?;
         if point.value(PRESET).is_none() || !args.options.wants_a_plan() {

@@ -370,7 +370,7 @@ impl<'a> TrainLoop<'a> {
             events.text(ended.step, "run/ended", &ended.to_string())?;
         }
         observe(Event::Ended(&ended));
-        trainer.drop_unused_degree()?;
+        trainer.drop_unused_denoiser()?;
         let spent = self.meter.spent(self.gpu.peak_memory());
         let evaluation = self.evaluate(trainer, directory, observe)?;
         let render = |view: &View| trainer.render(&view.camera);

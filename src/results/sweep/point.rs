@@ -1,10 +1,7 @@
 //! A point of a sweep: the settings in which its run differs from the others.
 
-use std::path::Path;
-
 use nightsplat_photographs::tone::ToneCurve;
 
-use crate::train::Part;
 use crate::{Error, Result};
 
 /// The axis of presets, which other settings override.
@@ -16,7 +13,7 @@ pub const PLAIN: &str = "plain";
 /// On that axis: every part.
 pub const ALL_PARTS: &str = "all";
 /// The axis that is averaged over.
-pub(super) const SEED: &str = "seed";
+pub const SEED: &str = "seed";
 /// The axis of fixed black levels.
 pub const OFFSET: &str = "offset";
 /// On that axis: the black level of alpha and beta.
@@ -35,6 +32,11 @@ const AXES: [(&str, &str); 10] = [
     (OFFSET, OFFSET),
     (SEED, SEED),
 ];
+
+/// The setting of an axis.
+pub fn setting_of(axis: &str) -> &str {
+    AXES.iter().find(|(name, _)| *name == axis).map_or(axis, |(_, setting)| setting)
+}
 
 /// A setting with a list of values.
 #[derive(Clone, Debug, PartialEq)]
@@ -115,13 +117,6 @@ pub fn all_curves() -> Vec<String> {
     ToneCurve::ALL.iter().map(|curve| curve.name().to_owned()).collect()
 }
 
-/// The argument for a curve: an absolute path if it is a file, else its name.
-fn curve(name: &str) -> String {
-    let is_file = name.contains(['.', '/']) && Path::new(name).is_file();
-    let path = is_file.then(|| std::path::absolute(name).ok()).flatten();
-    path.and_then(|path| path.to_str().map(str::to_owned)).unwrap_or_else(|| name.to_owned())
-}
-
 /// The settings of a point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SweepPoint {
@@ -157,33 +152,6 @@ impl SweepPoint {
             .bytes()
             .fold(0x811c_9dc5_u32, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193));
         format!("{name}-{hash:08x}")
-    }
-
-    /// Its arguments for `train`.
-    pub fn arguments(&self) -> Vec<String> {
-        let set = |key: &str, value: &str| pair("set", &format!("{key}={value}"));
-        let of = |(key, value): &(String, String)| match key.as_str() {
-            "curve" => pair(key, &curve(value)),
-            PARTS if value == PLAIN => pair("model", PLAIN),
-            PARTS if value == ALL_PARTS => pair(key, &Part::LITA.map(Part::name).join(",")),
-            PRESET | PARTS | "gain" | "theta" | SEED => pair(key, value),
-            OFFSET if value == ADAPTIVE => vec![],
-            OFFSET => [set("tone.alpha", value), set("tone.beta", "0")].concat(),
-            key => {
-                let setting = AXES.iter().find(|(name, _)| *name == key);
-                set(setting.map_or(key, |(_, setting)| setting), value)
-            }
-        };
-        self.values.iter().flat_map(of).collect()
-    }
-}
-
-/// An option and its value as arguments, joined if the value looks like an option.
-pub fn pair(long: &str, value: &str) -> Vec<String> {
-    if value.starts_with('-') {
-        vec![format!("--{long}={value}")]
-    } else {
-        vec![format!("--{long}"), value.to_owned()]
     }
 }
 

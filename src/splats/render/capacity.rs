@@ -3,9 +3,8 @@
 use glam::UVec2;
 use nightsplat_core::camera::Camera;
 
+use super::Renderer;
 use super::limits::max_tiles;
-use super::{Renderer, Sort};
-use crate::splats::sort::TileSort;
 use crate::{Error, Result};
 
 impl Renderer {
@@ -44,9 +43,7 @@ impl Renderer {
         }
         let before = self.context_count();
         self.frame.reserve(&self.gpu, before + gaussian_count, before + capacity, pixels, tiles)?;
-        if let Sort::Tiles(sort) = &mut self.sort {
-            sort.reserve_tiles(tiles)?;
-        }
+        self.sort.reserve_tiles(tiles)?;
         self.reserve_lamp()
     }
 
@@ -69,11 +66,7 @@ impl Renderer {
 
     /// Bytes per Gaussian beside its parameters.
     pub(crate) fn bytes_per_gaussian(&self) -> usize {
-        let by_depth = match &self.sort {
-            Sort::Whole { by_depth, .. } => by_depth.bytes_per_item(),
-            Sort::Tiles(_) => 0,
-        };
-        self.frame.bytes_per_gaussian() + by_depth
+        self.frame.bytes_per_gaussian() + self.sort.bytes_per_gaussian()
     }
 
     /// The bytes of the buffers whose size follows the numbers of a view's own Gaussians and of intersections, except
@@ -86,11 +79,7 @@ impl Renderer {
 
     /// Bytes per intersection of a view.
     pub(crate) fn bytes_per_intersection(&self) -> usize {
-        let sorted = match &self.sort {
-            Sort::Whole { by_tile, .. } => by_tile.bytes_per_item(),
-            Sort::Tiles(_) => TileSort::bytes_per_item(),
-        };
-        self.frame.bytes_per_intersection() + sorted
+        self.frame.bytes_per_intersection() + self.sort.bytes_per_intersection()
     }
 
     /// The intersections that memory is reserved for.
@@ -106,14 +95,7 @@ impl Renderer {
 
     /// Takes the memory of the sorts ahead of a recording.
     pub(super) fn reserve_sorts(&mut self) -> Result<()> {
-        let Self { frame, sort, .. } = self;
-        match sort {
-            Sort::Whole { by_depth, by_tile } => {
-                by_depth.reserve(frame.depth_keys.len())?;
-                by_tile.reserve(frame.tiles.len())
-            }
-            Sort::Tiles(tiles) => tiles.reserve(frame.tiles.len()),
-        }
+        self.sort.reserve(self.frame.depth_keys.len(), self.frame.tiles.len())
     }
 
     fn too_many_tiles(&self, size: UVec2) -> Error {

@@ -18,7 +18,6 @@ use crate::splats::camera::model_number;
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::Shape;
-use crate::splats::sort::{RadixSort, TileSort};
 
 impl Renderer {
     /// Builds the kernels; [`Renderer::reserve`] allocates.
@@ -88,13 +87,6 @@ impl Renderer {
         let state = tile_width * tile_height * (channels + 1);
         let segments = Segments { length: segment, state };
         let sorting = settings.sorting_on(gpu);
-        let sort = match sorting {
-            Sorting::Whole => {
-                let by_depth = RadixSort::new(gpu, 0)?;
-                Sort::Whole { by_tile: by_depth.another()?, by_depth }
-            }
-            Sorting::Tiles => Sort::Tiles(TileSort::new(gpu)?),
-        };
         Ok(Self {
             gpu: gpu.clone(),
             settings,
@@ -114,7 +106,7 @@ impl Renderer {
             blend_forward: blending(gpu, &settings, tile, segment, false)?,
             blend_depths: None,
             blend_backward,
-            sort,
+            sort: Sort::new(gpu, sorting)?,
             frame: RenderBuffers::new(gpu, settings.channels(), settings.purpose, segments)?,
             limits: gpu.uninit("limits", 1)?,
             host_targets: None,
