@@ -14,8 +14,8 @@ use nightsplat::ash::vk::Handle as _;
 use nightsplat::ash::{self, khr, vk};
 use nightsplat::glam::{DAffine3, DVec3, Vec3};
 use nightsplat::{
-    Camera, Gaussians, Gpu, HostDevice, HostFrame, HostImage, ImageFormat, ImageState, Purpose,
-    RenderOptions, RenderSettings, Renderer, Target, required_device_features,
+    Camera, FeatureStructs, Gaussians, Gpu, HostDevice, HostFrame, HostImage, ImageFormat,
+    ImageState, Purpose, RenderOptions, RenderSettings, Renderer, Target, require_features,
 };
 
 const SIZE: [u32; 2] = [320, 240];
@@ -116,12 +116,11 @@ impl Host {
                 .queue_family_index(family)
                 .queue_priorities(&[1.0])];
             let extensions = [khr::push_descriptor::NAME.as_ptr()];
-            let (mut vulkan12, mut vulkan13) = required_device_features();
-            let info = vk::DeviceCreateInfo::default()
+            let mut info = vk::DeviceCreateInfo::default()
                 .queue_create_infos(&queues)
-                .enabled_extension_names(&extensions)
-                .push_next(&mut vulkan12)
-                .push_next(&mut vulkan13);
+                .enabled_extension_names(&extensions);
+            let mut structs = FeatureStructs::default();
+            require_features((&raw mut info).cast(), &mut structs, &[]);
             let device = instance.create_device(physical, &info, None)?;
             let queue = device.get_device_queue(family, 0);
             let pool = vk::CommandPoolCreateInfo::default().queue_family_index(family);
@@ -135,7 +134,7 @@ impl Host {
     }
 
     /// The library records and never submits, so it needs no queue.
-    fn lend(&self) -> HostDevice {
+    fn lend(&self) -> HostDevice<'static> {
         HostDevice {
             get_instance_proc_addr: self.entry.static_fn().get_instance_proc_addr as *const c_void,
             instance: self.instance.handle().as_raw(),
@@ -143,6 +142,7 @@ impl Host {
             device: self.device.handle().as_raw(),
             queue_family: self.family,
             is_record_only: true,
+            extensions: &[khr::push_descriptor::NAME],
             frames: self.frames.as_raw(),
             ..HostDevice::default()
         }

@@ -20,6 +20,8 @@ mod device_report;
 mod download;
 #[cfg(debug_assertions)]
 mod faults;
+mod features;
+mod functions;
 mod host;
 mod image;
 mod instance;
@@ -64,17 +66,20 @@ pub(crate) use device::cache_folder;
 pub use device::check_physical_device;
 pub use device_report::{DeviceLimits, DeviceReport, RequirementReport, devices};
 pub use download::Download;
+pub use features::{FeatureStructs, require_features};
 pub use image::{HostImage, ImageFormat, ImageState};
 pub use kernel::{Binding, Bound, Interface, Kernel, Recordable};
 #[cfg(feature = "train")]
 pub use kernel::{OnHost, Reference};
-pub use lent::{HostAllocation, HostDevice, HostFrame, MemoryFunctions, QueueLock};
+pub use lent::{
+    HostAllocation, HostDevice, HostFrame, HostRequirements, MemoryFunctions, QueueLock,
+};
 pub(crate) use limits::WORKGROUP;
 pub use memory::MemoryBudget;
 pub use pci::PciAddress;
 pub use pipeline::Pipeline;
 pub use recorder::{Recorder, Threads};
-pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
+pub use requirements::{REQUIREMENTS, Requirement};
 pub(crate) use ring::Ring;
 pub use slice::{Slice, SliceMut};
 pub use statistics::{Resources, Statistic};
@@ -136,6 +141,7 @@ pub struct Properties {
 /// Everything that buffers, pipelines and submissions need to outlive their [`Gpu`].
 struct GpuShared {
     properties: Properties,
+    modules: device::ModuleForm,
     device: ash::Device,
     descriptors: descriptors::Descriptors,
     /// Names objects; absent without the validation layer.

@@ -170,10 +170,10 @@ pub use {ash, glam};
 
 // The device.
 pub use gpu::{
-    Buffer, CooperativeMatrix, DeviceChoice, DeviceLimits, DeviceReport, Gpu, HostAllocation,
-    HostDevice, HostFrame, HostImage, ImageFormat, ImageState, MemoryBudget, MemoryFunctions,
-    PassTime, PciAddress, Properties, QueueLock, Recorder, Requirement, RequirementReport, Slice,
-    Tile, devices, required_device_features,
+    Buffer, CooperativeMatrix, DeviceChoice, DeviceLimits, DeviceReport, FeatureStructs, Gpu,
+    HostAllocation, HostDevice, HostFrame, HostImage, HostRequirements, ImageFormat, ImageState,
+    MemoryBudget, MemoryFunctions, PassTime, PciAddress, Properties, QueueLock, Recorder,
+    Requirement, RequirementReport, Slice, Tile, check_physical_device, devices, require_features,
 };
 #[cfg(feature = "train")]
 pub use gpu::{CheckReport, CheckedPass, Difference};

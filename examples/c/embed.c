@@ -44,21 +44,18 @@ static void open_device(void) {
     vkGetPhysicalDeviceQueueFamilyProperties(physical, &count, families);
     while (family < count && !(families[family].queueFlags & VK_QUEUE_COMPUTE_BIT)) family++;
 
-    /* The host's own features first; the library adds what it needs and clears none. */
-    VkPhysicalDeviceVulkan13Features vulkan13 = {.sType = VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_VULKAN_1_3_FEATURES};
-    VkPhysicalDeviceVulkan12Features vulkan12 = {.sType = VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_VULKAN_1_2_FEATURES,
-                                                 .pNext = &vulkan13};
-    nsp_require_features(&vulkan12, &vulkan13);
     float priority = 1.0f;
     VkDeviceQueueCreateInfo queues = {.sType = VK_STRUCTURE_TYPE_DEVICE_QUEUE_CREATE_INFO,
                                       .queueFamilyIndex = family,
                                       .queueCount = 1,
                                       .pQueuePriorities = &priority};
     VkDeviceCreateInfo info = {.sType = VK_STRUCTURE_TYPE_DEVICE_CREATE_INFO,
-                               .pNext = &vulkan12,
                                .queueCreateInfoCount = 1,
                                .pQueueCreateInfos = &queues};
     info.ppEnabledExtensionNames = nsp_device_extensions(&info.enabledExtensionCount);
+    /* After the host's own features: the library adds what it needs and clears none. */
+    NspFeatureStructs structs = {.struct_size = sizeof structs};
+    if (!ok(nsp_require_features(&info, &structs))) exit(1);
     VK(vkCreateDevice(physical, &info, NULL, &device));
     vkGetDeviceQueue(device, family, 0, &queue);
 }
@@ -77,7 +74,7 @@ static VkDeviceMemory allocate(VkMemoryRequirements needed, VkMemoryPropertyFlag
 
 /* A camera that looks along z at the origin, from four units away. */
 static NspCamera camera(void) {
-    NspCamera own = {.width = WIDTH, .height = HEIGHT, .focal = {300, 300}};
+    NspCamera own = {.struct_size = sizeof own, .width = WIDTH, .height = HEIGHT, .focal = {300, 300}};
     own.principal_point[0] = WIDTH / 2.0, own.principal_point[1] = HEIGHT / 2.0;
     double pose[12] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4};
     memcpy(own.view_from_world, pose, sizeof pose);
@@ -154,8 +151,8 @@ int main(int argc, char **argv) {
         VK(vkBeginCommandBuffer(commands, &begin));
 
         /* The host's passes before this one go here. The image is taken from `before` and left in `after`. */
-        NspImage color = {.image = image, .format = VK_FORMAT_R8G8B8A8_UNORM, .extent = {WIDTH, HEIGHT}};
-        color.before.family = color.after.family = VK_QUEUE_FAMILY_IGNORED;
+        NspImage color = {.struct_size = sizeof color, .image = image, .format = VK_FORMAT_R8G8B8A8_UNORM};
+        color.extent.width = WIDTH, color.extent.height = HEIGHT;
         color.before.layout = VK_IMAGE_LAYOUT_UNDEFINED;
         color.after.layout = VK_IMAGE_LAYOUT_TRANSFER_SRC_OPTIMAL;
         color.after.stages = VK_PIPELINE_STAGE_2_COPY_BIT;

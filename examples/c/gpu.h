@@ -103,13 +103,11 @@ static Gpu open_gpu(const Hello *wanted)
     float priority = 1;
     VkDeviceQueueCreateInfo queue = {.sType = VK_STRUCTURE_TYPE_DEVICE_QUEUE_CREATE_INFO,
         .queueFamilyIndex = gpu.family, .queueCount = 1, .pQueuePriorities = &priority};
-    VkPhysicalDeviceVulkan13Features vulkan13 = {.sType = VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_VULKAN_1_3_FEATURES};
-    VkPhysicalDeviceVulkan12Features vulkan12 = {.sType = VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_VULKAN_1_2_FEATURES,
-                                                 .pNext = &vulkan13};
-    nsp_require_features(&vulkan12, &vulkan13);
-    VkDeviceCreateInfo device = {.sType = VK_STRUCTURE_TYPE_DEVICE_CREATE_INFO, .pNext = &vulkan12,
+    VkDeviceCreateInfo device = {.sType = VK_STRUCTURE_TYPE_DEVICE_CREATE_INFO,
         .queueCreateInfoCount = 1, .pQueueCreateInfos = &queue,
         .enabledExtensionCount = gpu.extension_count, .ppEnabledExtensionNames = gpu.extensions};
+    NspFeatureStructs structs = {.struct_size = sizeof structs};
+    NSP(nsp_require_features(&device, &structs));
     VK(vkCreateDevice(gpu.physical, &device, NULL, &gpu.device));
     vkGetDeviceQueue(gpu.device, gpu.family, 0, &gpu.queue);
     VkCommandPoolCreateInfo pool = {.sType = VK_STRUCTURE_TYPE_COMMAND_POOL_CREATE_INFO,

@@ -60,8 +60,8 @@ static uint64_t hash(const uint8_t *bytes)
 static NspCamera camera(uint64_t frame)
 {
     double sine = sin(0.1 * (double)frame), cosine = cos(0.1 * (double)frame);
-    NspCamera made = {WIDTH, HEIGHT, {250, 250}, {WIDTH / 2.0, HEIGHT / 2.0},
-                      {cosine, 0, -sine, 0, 0, 1, 0, 0, sine, 0, cosine, 4}};
+    NspCamera made = {sizeof made, WIDTH, HEIGHT, {250, 250}, {WIDTH / 2.0, HEIGHT / 2.0},
+                      {cosine, 0, -sine, 0, 0, 1, 0, 0, sine, 0, cosine, 4}, 0, 0, {0}};
     return made;
 }
 
@@ -97,8 +97,8 @@ static void draw(NspRenderer *renderer, const NspModel *model, VkCommandBuffer c
                  NspImageState after)
 {
     NspCamera view = camera(frame);
-    NspImage color = {.image = image, .format = VK_FORMAT_R16G16B16A16_SFLOAT, .extent = {WIDTH, HEIGHT},
-        .before = {VK_IMAGE_LAYOUT_UNDEFINED, VK_QUEUE_FAMILY_IGNORED, VK_PIPELINE_STAGE_2_ALL_TRANSFER_BIT, 0},
+    NspImage color = {.struct_size = sizeof color, .image = image, .format = VK_FORMAT_R16G16B16A16_SFLOAT, .extent = {WIDTH, HEIGHT},
+        .before = {.stages = VK_PIPELINE_STAGE_2_ALL_TRANSFER_BIT},
         .after = after};
     NspRender render = {.struct_size = sizeof render, .commands = commands, .frame = frame,
                         .cameras = &view, .camera_count = 1, .color = &color};
@@ -143,11 +143,13 @@ static int render(int socket, const char *path, uint64_t frame_count)
         Slot *slot = &slots[drawn.slot];
         wait_frame(&gpu, frame > RING ? frame - RING : 0);
         begin(slot->commands);
-        NspImageState released = {VK_IMAGE_LAYOUT_TRANSFER_SRC_OPTIMAL, VK_QUEUE_FAMILY_EXTERNAL, 0, 0};
+        NspImageState released = {.layout = VK_IMAGE_LAYOUT_TRANSFER_SRC_OPTIMAL,
+                                  .family = VK_QUEUE_FAMILY_EXTERNAL, .is_owned = 1};
         draw(renderer, model, slot->commands, frame, shared[drawn.slot].image, released);
         /* Only to compare: the same view into an image of our own, which is read here. */
-        NspImageState copied = {VK_IMAGE_LAYOUT_TRANSFER_SRC_OPTIMAL, VK_QUEUE_FAMILY_IGNORED,
-                                VK_PIPELINE_STAGE_2_ALL_TRANSFER_BIT, VK_ACCESS_2_TRANSFER_READ_BIT};
+        NspImageState copied = {.layout = VK_IMAGE_LAYOUT_TRANSFER_SRC_OPTIMAL,
+                                .stages = VK_PIPELINE_STAGE_2_ALL_TRANSFER_BIT,
+                                .access = VK_ACCESS_2_TRANSFER_READ_BIT};
         draw(renderer, model, slot->commands, frame, own.image, copied);
         read_image(slot, own.image);
         submit(&gpu, slot->commands, VK_NULL_HANDLE, 0, gpu.frames, frame);

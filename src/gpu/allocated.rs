@@ -4,12 +4,13 @@ use std::ffi::CString;
 use std::sync::Arc;
 
 use ash::vk;
+use ash::vk::Handle as _;
 use gpu_allocator::vulkan::{
     Allocation as Piece, AllocationCreateDesc, AllocationScheme, Allocator,
 };
 use gpu_allocator::{AllocationError, MemoryLocation};
 
-use super::lent::{HostAllocation, MemoryFunctions};
+use super::lent::{HostAllocation, HostRequirements, MemoryFunctions};
 use super::limits::whole_quads;
 use super::{Bound, GpuShared, LastUse, Retired, lock};
 use crate::{Error, Result};
@@ -57,6 +58,8 @@ unsafe impl Send for MemorySource {}
 pub enum HostMemoryError {
     #[error("the host's allocator returned {0:?}")]
     Refused(vk::Result),
+    #[error("the host's allocator returned success, but memory that is null")]
+    Null,
     #[error("the host's allocator returned offset {offset}, which is no multiple of {alignment}")]
     Misaligned { offset: u64, alignment: u64 },
     #[error("the host's allocator returned no mapped address")]
@@ -125,30 +128,42 @@ fn host_piece(
     };
     let name = CString::new(name).unwrap_or_default();
     let mut allocation = HostAllocation {
-        memory: vk::DeviceMemory::null(),
+        memory: 0,
         offset: 0,
         mapped: std::ptr::null_mut(),
         cookie: std::ptr::null_mut(),
     };
     let MemoryFunctions { allocate, free, user } = *functions;
+    let vk::MemoryRequirements { size, alignment, memory_type_bits: memory_types } = *requirements;
+    let needed = HostRequirements { size, alignment, memory_types };
+    let [required_flags, preferred] = [required, preferred].map(Properties::as_raw);
     // SAFETY: every pointer is to a live local; the function is the host's.
     let result = unsafe {
-        allocate(user, requirements, required, preferred, name.as_ptr(), &raw mut allocation)
+        allocate(
+            user,
+            &raw const needed,
+            required_flags,
+            preferred,
+            name.as_ptr(),
+            &raw mut allocation,
+        )
     };
-    let vk::MemoryRequirements { alignment, size, .. } = *requirements;
     let offset = allocation.offset;
-    let problem = match result {
+    let problem = match vk::Result::from_raw(result) {
         vk::Result::SUCCESS if !offset.is_multiple_of(alignment.max(1)) => {
             HostMemoryError::Misaligned { offset, alignment }
         }
+        vk::Result::SUCCESS if allocation.memory == 0 => HostMemoryError::Null,
         vk::Result::SUCCESS if !required.is_empty() && allocation.mapped.is_null() => {
             HostMemoryError::Unmapped
         }
         vk::Result::SUCCESS => return Ok(HostPiece { allocation, size }),
         result => return Err(HostMemoryError::Refused(result)),
     };
-    // SAFETY: the host's function gets what it just gave.
-    unsafe { free(user, &allocation) };
+    if !matches!(problem, HostMemoryError::Null) {
+        // SAFETY: the host's function gets what it just gave.
+        unsafe { free(user, &allocation) };
+    }
     Err(problem)
 }
 
@@ -164,7 +179,9 @@ impl Allocation {
         match self {
             // SAFETY: the memory is bound to a buffer and not freed by hand.
             Self::Ours(piece) => (unsafe { piece.memory() }, piece.offset()),
-            Self::Hosts(HostPiece { allocation, .. }) => (allocation.memory, allocation.offset),
+            Self::Hosts(HostPiece { allocation, .. }) => {
+                (vk::DeviceMemory::from_raw(allocation.memory), allocation.offset)
+            }
         }
     }
 }

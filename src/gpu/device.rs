@@ -17,6 +17,8 @@ use super::descriptors::Descriptors;
 use super::device_report::{device_memory, driver_name, report};
 #[cfg(debug_assertions)]
 use super::faults::Faults;
+use super::features::{FullSubgroups, check_enabled};
+use super::functions::{CoreVersion, host_device, host_instance};
 use super::host::Host;
 use super::instance::{
     OwnedInstance, instance, loader_error, physical_devices, validation_is_installed,
@@ -24,7 +26,6 @@ use super::instance::{
 };
 use super::limits::max_workgroups;
 use super::memory::{BudgetQuery, MemoryUsage};
-use super::requirements::required_device_features;
 use super::supported::{OPTIONAL_EXTENSIONS, Supported};
 use super::validation::FIRST_SAFE_WITH_LABELS;
 use super::vulkan_error;
@@ -73,6 +74,7 @@ impl Gpu {
                 |(device, queue, family)| DeviceParts {
                     physical,
                     properties,
+                    modules: ModuleForm::OWN,
                     device,
                     queue,
                     family,
@@ -95,38 +97,32 @@ impl Gpu {
     /// Takes a device that the host application lends. Nothing of the host's is destroyed or changed.
     ///
     /// # Errors
-    /// The device lacks a requirement, or `get_instance_proc_addr` is null.
+    /// The device lacks a requirement, or a function that is used; `get_instance_proc_addr` is null.
     ///
     /// # Safety
     /// The handles are valid and stay so for as long as the `Gpu` and everything made with it; the required features
-    /// and extensions are enabled; without [`HostDevice::queue_lock`] no other thread uses the queue while a `Gpu`
-    /// method submits to it; every frame of the host's is done when the `Gpu` and everything made with it is dropped.
-    pub unsafe fn from_host(host: HostDevice) -> Result<Self> {
-        // SAFETY: the caller says that the address is this function's; null becomes `None`.
-        let get_instance_proc_addr = unsafe {
-            std::mem::transmute::<*const c_void, Option<vk::PFN_vkGetInstanceProcAddr>>(
-                host.get_instance_proc_addr,
-            )
-        };
-        let Some(get_instance_proc_addr) = get_instance_proc_addr else {
-            let problem = "HostDevice::get_instance_proc_addr is null: pass the host's";
-            return Err(Error::Usage(problem.to_owned()));
-        };
-        let static_fn = ash::StaticFn { get_instance_proc_addr };
+    /// and the stated extensions are enabled; without [`HostDevice::queue_lock`] no other thread uses the queue while a
+    /// `Gpu` method submits to it; every frame of the host's is done when the `Gpu` and everything made with it is
+    /// dropped.
+    pub unsafe fn from_host(host: HostDevice<'_>) -> Result<Self> {
         let physical = vk::PhysicalDevice::from_raw(host.physical_device);
         // SAFETY: the host's handles are valid.
-        let (instance, device) = unsafe {
-            let instance = ash::Instance::load(&static_fn, vk::Instance::from_raw(host.instance));
-            let device = ash::Device::load(instance.fp_v1_0(), vk::Device::from_raw(host.device));
-            (instance, device)
+        let (instance, device, version) = unsafe {
+            let get = loader_function(host.get_instance_proc_addr)?;
+            let instance = host_instance(get, vk::Instance::from_raw(host.instance))?;
+            let (device, version) = host_device(&instance, vk::Device::from_raw(host.device))?;
+            (instance, device, version)
         };
         let supported = Supported::gather(&instance, physical).map_err(loader_error)?;
         supported.check()?;
         let (queue, family) = (vk::Queue::from_raw(host.queue), host.queue_family);
         check_family(&instance, physical, family)?;
+        // SAFETY: the host says what it enabled.
+        let full_subgroups = unsafe { check_enabled(host.features, version) }?;
+        let modules = ModuleForm::of_host(version, full_subgroups, host.extensions)?;
         let mut properties = properties(&instance, physical, &supported)?;
-        properties.has_push_descriptors &= host.has_push_descriptors;
-        let parts = DeviceParts { physical, properties, device, queue, family };
+        properties.has_push_descriptors &= host.extensions.contains(&khr::push_descriptor::NAME);
+        let parts = DeviceParts { physical, properties, modules, device, queue, family };
         Self::assemble(&instance, parts, Owner::Host(&host))
     }
 
@@ -140,7 +136,7 @@ impl Gpu {
         #[cfg(debug_assertions)]
         let faults = Faults::from_environment()?;
         let memory = memory_source(instance, &parts, &owner)?;
-        let DeviceParts { physical, properties, device, queue, family } = parts;
+        let DeviceParts { physical, properties, modules, device, queue, family } = parts;
         // SAFETY: the host says that its callbacks outlive the device.
         let callbacks = unsafe { owner.callbacks() };
         let (timeline, pipeline_cache) =
@@ -158,6 +154,7 @@ impl Gpu {
             shared: Arc::new(GpuShared {
                 descriptors: Descriptors::new(instance, &device, properties.has_push_descriptors),
                 properties,
+                modules,
                 labels: debug.clone().filter(|_| has_labels),
                 debug,
                 executables,
@@ -197,25 +194,78 @@ fn check_family(instance: &ash::Instance, physical: vk::PhysicalDevice, family: 
     )))
 }
 
-/// Whether a physical device of a host's can be used.
+/// Whether a physical device of a host's can be used: the address of `vkGetInstanceProcAddr`, a `VkInstance` and a
+/// `VkPhysicalDevice`.
+///
+/// # Errors
+/// A requirement is missing, or a function of the instance.
 ///
 /// # Safety
 /// The handles are valid.
 pub unsafe fn check_physical_device(
-    get_instance_proc_addr: vk::PFN_vkGetInstanceProcAddr,
-    instance: vk::Instance,
-    physical: vk::PhysicalDevice,
+    get_instance_proc_addr: *const c_void,
+    instance: u64,
+    physical_device: u64,
 ) -> Result<()> {
     // SAFETY: as the caller promises.
-    let instance =
-        unsafe { ash::Instance::load(&ash::StaticFn { get_instance_proc_addr }, instance) };
+    let instance = unsafe {
+        let get = loader_function(get_instance_proc_addr)?;
+        host_instance(get, vk::Instance::from_raw(instance))?
+    };
+    let physical = vk::PhysicalDevice::from_raw(physical_device);
     Supported::gather(&instance, physical).map_err(loader_error)?.check()
+}
+
+/// # Safety
+/// The address is null or that of `vkGetInstanceProcAddr`.
+unsafe fn loader_function(address: *const c_void) -> Result<vk::PFN_vkGetInstanceProcAddr> {
+    // SAFETY: as the caller promises; null becomes `None`.
+    let function = unsafe {
+        std::mem::transmute::<*const c_void, Option<vk::PFN_vkGetInstanceProcAddr>>(address)
+    };
+    let problem = "get_instance_proc_addr is NULL; pass the host's vkGetInstanceProcAddr";
+    function.ok_or_else(|| Error::Usage(problem.to_owned()))
+}
+
+/// How kernels are handed to the driver.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ModuleForm {
+    /// The SPIR-V version that modules declare; `None`: that of the compiler, 1.5.
+    pub(super) spirv_version: Option<u32>,
+    /// Pipelines have the flag for full subgroups.
+    pub(super) has_subgroup_flag: bool,
+}
+
+impl ModuleForm {
+    const OWN: Self = Self { spirv_version: None, has_subgroup_flag: true };
+
+    fn of_host(
+        version: CoreVersion,
+        full_subgroups: FullSubgroups,
+        extensions: &[&CStr],
+    ) -> Result<Self> {
+        const SPIRV_1_4: u32 = 0x1_0400;
+        const SPIRV_1_6: u32 = 0x1_0600;
+        let has_subgroup_flag = full_subgroups == FullSubgroups::ByFlag;
+        let spirv_version = match version {
+            CoreVersion::V1_1 if extensions.contains(&khr::spirv_1_4::NAME) => Some(SPIRV_1_4),
+            CoreVersion::V1_1 => {
+                let problem = "an instance of Vulkan 1.1 needs VK_KHR_spirv_1_4 on the device, among the extensions \
+                               that are passed; or create the instance with VkApplicationInfo::apiVersion 1.2";
+                return Err(Error::NoDevice(problem.to_owned()));
+            }
+            _ if has_subgroup_flag => None,
+            _ => Some(SPIRV_1_6),
+        };
+        Ok(Self { spirv_version, has_subgroup_flag })
+    }
 }
 
 /// A device before it is a [`Gpu`].
 struct DeviceParts {
     physical: vk::PhysicalDevice,
     properties: Properties,
+    modules: ModuleForm,
     device: ash::Device,
     queue: vk::Queue,
     family: u32,
@@ -224,7 +274,7 @@ struct DeviceParts {
 /// Who created the device.
 enum Owner<'a> {
     Ours(Box<OwnedInstance>),
-    Host(&'a HostDevice),
+    Host(&'a HostDevice<'a>),
 }
 
 impl Owner<'_> {
@@ -372,6 +422,19 @@ fn properties(
 /// (`LP_MAX_TGSI_LOOP_ITERATIONS`).
 const LLVMPIPE_LOOP_ITERATIONS: u32 = 65_535;
 
+/// The features that a device of our own is created with.
+pub(super) fn own_features()
+-> (vk::PhysicalDeviceVulkan12Features<'static>, vk::PhysicalDeviceVulkan13Features<'static>) {
+    let vulkan12 = vk::PhysicalDeviceVulkan12Features::default()
+        .timeline_semaphore(true)
+        .scalar_block_layout(true);
+    let vulkan13 = vk::PhysicalDeviceVulkan13Features::default()
+        .synchronization2(true)
+        .subgroup_size_control(true)
+        .compute_full_subgroups(true);
+    (vulkan12, vulkan13)
+}
+
 fn create_device(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
@@ -389,7 +452,7 @@ fn create_device(
     };
     let optional = OPTIONAL_EXTENSIONS.iter().copied().filter(is_wanted);
     let mut extensions: Vec<_> = optional.map(CStr::as_ptr).collect();
-    let (mut vulkan12, mut vulkan13) = required_device_features();
+    let (mut vulkan12, mut vulkan13) = own_features();
     let mut matrices =
         vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);
     let mut halves =

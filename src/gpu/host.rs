@@ -2,14 +2,16 @@
 //!
 //! - The host's timeline is a use of a resource: what a recording for frame `n` uses is kept until the host says that
 //!   frame `n` is done, by its timeline semaphore or by [`Gpu::frames_done`].
-//! - Uploads wait for the next recording: creating a buffer or a renderer submits nothing.
+//! - Uploads wait for the next recording: creating a buffer or a renderer submits nothing. A recording that the host
+//!   drops leaves them to the one after it.
 //! - Our own submissions hold the host's lock around `vkQueueSubmit2` alone; a record-only device has none.
 
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 
 use ash::vk;
 use ash::vk::Handle as _;
+use gpu_allocator::MemoryLocation;
 
 use super::allocated::DeviceMemory;
 use super::lent::{HostDevice, HostFrame, QueueLock};
@@ -27,6 +29,8 @@ pub(super) struct Host {
     last_frame: AtomicU64,
     /// Uploads for the next recording, in order.
     uploads: Mutex<Vec<Upload>>,
+    /// Those of recordings that may have been dropped.
+    recorded: Mutex<Vec<RecordedUploads>>,
     /// The pipeline cache is the host's.
     pub(super) lends_pipeline_cache: bool,
 }
@@ -50,6 +54,20 @@ pub(super) enum Upload {
     },
 }
 
+/// The uploads of a recording.
+struct RecordedUploads {
+    frame: u64,
+    uploads: Vec<Upload>,
+    /// A word on the host that the recording sets to 1: a frame that is done may never have been submitted.
+    has_run: DeviceMemory,
+}
+
+impl RecordedUploads {
+    fn have_run(&self) -> bool {
+        self.has_run.mapped().is_none_or(|mapped| mapped[0] == 1)
+    }
+}
+
 impl Upload {
     fn target(&self) -> vk::Buffer {
         match self {
@@ -68,7 +86,7 @@ impl Upload {
 }
 
 impl Host {
-    pub(super) fn new(lent: &HostDevice) -> Self {
+    pub(super) fn new(lent: &HostDevice<'_>) -> Self {
         Self {
             is_record_only: lent.is_record_only,
             queue_lock: lent.queue_lock,
@@ -76,6 +94,7 @@ impl Host {
             frames_done: AtomicU64::new(0),
             last_frame: AtomicU64::new(0),
             uploads: Mutex::default(),
+            recorded: Mutex::default(),
             lends_pipeline_cache: lent.pipeline_cache != 0,
         }
     }
@@ -85,6 +104,7 @@ impl Host {
         let Some(QueueLock { lock, unlock, user }) = self.queue_lock else { return submit() };
         // SAFETY: the host promises that both can be called from any thread with its own pointer.
         unsafe {
+            let queue = queue.as_raw() as *mut std::ffi::c_void;
             lock(user, queue);
             let done = submit();
             unlock(user, queue);
@@ -98,10 +118,16 @@ impl Host {
 
     /// Forgets the uploads into a buffer that is dropped.
     pub(super) fn forget(&self, target: vk::Buffer) {
-        // Staging memory is dropped once the list is free again.
-        let forgotten: Vec<_> =
-            lock(&self.uploads).extract_if(.., |upload| upload.target() == target).collect();
+        let is_into = |upload: &mut Upload| upload.target() == target;
+        // Memory is dropped once the lists are free again.
+        let forgotten: Vec<_> = lock(&self.uploads).extract_if(.., is_into).collect();
         drop(forgotten);
+        let mut recorded = lock(&self.recorded);
+        let forgotten: Vec<_> =
+            recorded.iter_mut().flat_map(|them| them.uploads.extract_if(.., is_into)).collect();
+        let empty: Vec<_> = recorded.extract_if(.., |them| them.uploads.is_empty()).collect();
+        drop(recorded);
+        drop((forgotten, empty));
     }
 }
 
@@ -126,24 +152,59 @@ impl GpuShared {
     /// Begins a recording with the uploads that wait for one; `record` follows. Where it fails, the next recording
     /// begins with them again.
     pub(super) fn with_uploads(
-        &self,
+        self: &Arc<Self>,
         recorder: &mut Recorder<'_>,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
     ) -> Result<()> {
         let Some(host) = &self.host else { return record(recorder) };
+        if lock(&host.uploads).is_empty() {
+            return record(recorder);
+        }
+        let mut has_run = DeviceMemory::new(self, "has run", 4, MemoryLocation::GpuToCpu)?;
+        if let Some(mapped) = has_run.mapped_mut() {
+            mapped.fill(0);
+        }
         let mut uploads = std::mem::take(&mut *lock(&host.uploads));
         uploads.iter().for_each(|upload| upload.record(recorder));
-        record(recorder).inspect_err(|_| {
+        let done = record(recorder);
+        if done.is_ok() {
+            recorder.fill_raw(has_run.bound(), 1);
+            recorder.leave_for_host();
+            let frame = self.last_frame();
+            lock(&host.recorded).push(RecordedUploads { frame, uploads, has_run });
+        } else {
             let mut waiting = lock(&host.uploads);
             uploads.append(&mut waiting);
-            *waiting = std::mem::take(&mut uploads);
-        })
+            *waiting = uploads;
+        }
+        done
+    }
+
+    /// Frees the uploads that the device has run. Those of a recording that was dropped wait for the next one.
+    fn settle_uploads(&self) {
+        let Some(host) = &self.host else { return };
+        let reached = self.frames_reached();
+        let settled: Vec<_> =
+            lock(&host.recorded).extract_if(.., |them| them.frame <= reached).collect();
+        let mut dropped = vec![];
+        for mut them in settled {
+            if !them.have_run() {
+                let frame = them.frame;
+                tracing::warn!("frame {frame} was not submitted; its uploads are part of the next");
+                dropped.append(&mut them.uploads);
+            }
+        }
+        let mut waiting = lock(&host.uploads);
+        dropped.append(&mut waiting);
+        *waiting = dropped;
     }
 }
 
 impl Gpu {
     /// Records into a command buffer of the host application, which submits it once, in the order of recording. What
-    /// the recording uses is kept until the frame is done.
+    /// the recording uses is kept until the frame is done. It begins with the uploads that wait, and a recording of
+    /// nothing else is one of uploads alone. Where a host drops a recording and reports its frame as done, its uploads
+    /// are part of the next.
     ///
     /// # Errors
     /// What `record` returns; [`Error::Usage`] where the frame's number falls, the device is not lent, or this thread
@@ -170,6 +231,7 @@ impl Gpu {
             )));
         }
         host.last_frame.store(number, Ordering::Release);
+        shared.settle_uploads();
         shared.collect(shared.reached());
         let mut recorder = Recorder::for_host(shared, frame);
         shared.with_uploads(&mut recorder, record)?;
@@ -181,6 +243,7 @@ impl Gpu {
     pub fn frames_done(&self, frame: u64) {
         if let Some(host) = &self.shared.host {
             host.frames_done.fetch_max(frame, Ordering::AcqRel);
+            self.shared.settle_uploads();
         }
         self.shared.collect(self.shared.reached());
     }

@@ -1,14 +1,14 @@
 //! What a host application lends: handles, functions, and the command buffer of a frame.
 
-use std::ffi::{c_char, c_void};
-
-use ash::vk;
+use std::ffi::{CStr, c_char, c_void};
 
 /// A device that a host application lends, as raw handles, so that C++ hosts and other Vulkan bindings work.
 ///
-/// The host must have enabled [`super::required_device_features`] on the device. It should enable
-/// `VK_KHR_push_descriptor` where that is supported, which makes recording faster. It keeps device, instance and queue
-/// alive for as long as the [`Gpu`](super::Gpu) and everything made with it. What is left at its default is not used:
+/// The host must have enabled what [`super::require_features`] enables. The instance is of Vulkan 1.1 or later. Where it
+/// is not of Vulkan 1.3, the device has the extensions `VK_KHR_synchronization2` and `VK_EXT_subgroup_size_control`;
+/// where it is of Vulkan 1.1, also `VK_KHR_timeline_semaphore`, `VK_EXT_scalar_block_layout` and `VK_KHR_spirv_1_4`. The
+/// host keeps device, instance and queue alive for as long as the [`Gpu`](super::Gpu) and everything made with it. What
+/// is left at its default is not used:
 ///
 /// ```
 /// use nightsplat::HostDevice;
@@ -16,7 +16,7 @@ use ash::vk;
 /// let host = HostDevice { queue_family: 0, is_record_only: true, ..HostDevice::default() };
 /// ```
 #[derive(Clone, Copy, Debug)]
-pub struct HostDevice {
+pub struct HostDevice<'a> {
     /// The address of `vkGetInstanceProcAddr` of the host's loader.
     pub get_instance_proc_addr: *const c_void,
     /// `VkInstance`.
@@ -31,8 +31,12 @@ pub struct HostDevice {
     pub queue_family: u32,
     /// Nothing is submitted: uploads are part of the next recording, and a call that would submit is an error.
     pub is_record_only: bool,
-    /// The host enabled `VK_KHR_push_descriptor`; without it descriptors are bound in sets.
-    pub has_push_descriptors: bool,
+    /// The names of the device extensions that the host enabled; others are not used. With `VK_KHR_push_descriptor`
+    /// recording is faster.
+    pub extensions: &'a [&'a CStr],
+    /// The features that the host enabled: its `VkPhysicalDeviceFeatures2`, or another chain of feature structs; null:
+    /// those of [`super::require_features`].
+    pub features: *const c_void,
     /// The host enabled `VK_EXT_debug_utils` on the instance: objects are named, passes are labelled.
     pub names_objects: bool,
     /// Held around each of our submissions. `None`: no other thread uses the queue meanwhile.
@@ -48,7 +52,7 @@ pub struct HostDevice {
     pub device_memory: Option<MemoryFunctions>,
 }
 
-impl Default for HostDevice {
+impl Default for HostDevice<'_> {
     fn default() -> Self {
         Self {
             get_instance_proc_addr: std::ptr::null(),
@@ -58,7 +62,8 @@ impl Default for HostDevice {
             queue: 0,
             queue_family: 0,
             is_record_only: false,
-            has_push_descriptors: true,
+            extensions: &[],
+            features: std::ptr::null(),
             names_objects: false,
             queue_lock: None,
             frames: 0,
@@ -73,10 +78,10 @@ impl Default for HostDevice {
 /// allocate, record or call back.
 #[derive(Clone, Copy, Debug)]
 pub struct QueueLock {
-    /// Takes the lock.
-    pub lock: unsafe extern "C" fn(user: *mut c_void, queue: vk::Queue),
+    /// Takes the lock of a `VkQueue`.
+    pub lock: unsafe extern "C" fn(user: *mut c_void, queue: *mut c_void),
     /// Releases it.
-    pub unlock: unsafe extern "C" fn(user: *mut c_void, queue: vk::Queue),
+    pub unlock: unsafe extern "C" fn(user: *mut c_void, queue: *mut c_void),
     /// Passed to both.
     pub user: *mut c_void,
 }
@@ -86,28 +91,40 @@ pub struct QueueLock {
 #[derive(Clone, Copy, Debug)]
 pub struct HostAllocation {
     /// The `VkDeviceMemory`.
-    pub memory: vk::DeviceMemory,
+    pub memory: u64,
     /// Bytes from its start; a multiple of the alignment that was required.
-    pub offset: vk::DeviceSize,
+    pub offset: u64,
     /// The address of the first byte where host-visible memory was required; otherwise ignored.
     pub mapped: *mut c_void,
     /// For the host's use.
     pub cookie: *mut c_void,
 }
 
+/// What memory has to be: `VkMemoryRequirements`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct HostRequirements {
+    /// Bytes.
+    pub size: u64,
+    /// Bytes that the offset is a multiple of.
+    pub alignment: u64,
+    /// A bit for each memory type that it may be of.
+    pub memory_types: u32,
+}
+
 /// The host's allocator of device memory. Any thread may call it.
 #[derive(Clone, Copy, Debug)]
 pub struct MemoryFunctions {
-    /// Fills `out` with memory that has every `required` property and, where there is such memory, every `preferred`
-    /// one. `name` says what it is for.
+    /// Fills `out` with memory that has every `required` property (`VkMemoryPropertyFlags`) and, where there is such
+    /// memory, every `preferred` one. `name` says what it is for. Returns a `VkResult`.
     pub allocate: unsafe extern "C" fn(
         user: *mut c_void,
-        requirements: *const vk::MemoryRequirements,
-        required: vk::MemoryPropertyFlags,
-        preferred: vk::MemoryPropertyFlags,
+        requirements: *const HostRequirements,
+        required: u32,
+        preferred: u32,
         name: *const c_char,
         out: *mut HostAllocation,
-    ) -> vk::Result,
+    ) -> i32,
     /// Frees memory of `allocate`.
     pub free: unsafe extern "C" fn(user: *mut c_void, allocation: *const HostAllocation),
     /// Passed to both.

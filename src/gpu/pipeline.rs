@@ -214,8 +214,13 @@ unsafe fn raw_pipeline(
     if driver_specializes {
         stage = stage.specialization_info(&specialization);
     }
+    if let Some(version) = shared.modules.spirv_version {
+        code[1] = version;
+    }
     if interface.subgroup_size_id.is_some() {
-        stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
+        if shared.modules.has_subgroup_flag {
+            stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
+        }
         // Where a device cannot be told the subgroup size, its only size is the one it reports.
         if shared.properties.subgroup_size_is_selectable {
             stage = stage.push_next(&mut required);

@@ -114,6 +114,10 @@ impl<'g> Recorder<'g> {
             ..Self::unstarted(shared, commands, vk::PipelineStageFlags2::HOST)
         };
         recorder.barrier();
+        if let Some(queries) = recorder.queries() {
+            // SAFETY: recording, and no other submission uses the pool.
+            unsafe { shared.device.cmd_reset_query_pool(commands, queries, 0, MAX_TIMESTAMPS) };
+        }
         recorder.timestamp(0);
         Ok(recorder)
     }
@@ -403,14 +407,17 @@ impl<'g> Recorder<'g> {
         }
     }
 
+    fn queries(&self) -> Option<vk::QueryPool> {
+        self.timestamps.map(|timestamps| match timestamps {
+            Timestamps::OfPasses(queries) | Timestamps::OfAll(queries) => queries,
+        })
+    }
+
     /// The time when everything recorded so far is done.
     fn timestamp(&self, index: u32) {
-        let queries = self.timestamps.map(|timestamps| match timestamps {
-            Timestamps::OfPasses(queries) | Timestamps::OfAll(queries) => queries,
-        });
-        if let Some(queries) = queries.filter(|_| index < MAX_TIMESTAMPS) {
+        if let Some(queries) = self.queries().filter(|_| index < MAX_TIMESTAMPS) {
             let stage = vk::PipelineStageFlags2::ALL_COMMANDS;
-            // SAFETY: the query was reset before recording began.
+            // SAFETY: the query was reset when the recording began.
             unsafe {
                 self.shared.device.cmd_write_timestamp2(self.commands, stage, queries, index);
             }

@@ -65,11 +65,6 @@ pub const REQUIREMENTS: &[Requirement] = &[
         supported: |o| o.vulkan12.scalar_block_layout == vk::TRUE,
     },
     Requirement {
-        name: "hostQueryReset",
-        why: "timestamps of every pass",
-        supported: |o| o.vulkan12.host_query_reset == vk::TRUE,
-    },
-    Requirement {
         name: "synchronization2",
         why: "barriers and submissions",
         supported: |o| o.vulkan13.synchronization2 == vk::TRUE,
@@ -111,22 +106,6 @@ pub const REQUIREMENTS: &[Requirement] = &[
     },
 ];
 
-/// The features that a device must be created with, to chain into `VkDeviceCreateInfo`, for hosts that lend their
-/// device to [`Gpu::from_host`](super::Gpu::from_host). With the extension `VK_KHR_push_descriptor`, where it is
-/// supported, recording is faster.
-pub fn required_device_features()
--> (vk::PhysicalDeviceVulkan12Features<'static>, vk::PhysicalDeviceVulkan13Features<'static>) {
-    let vulkan12 = vk::PhysicalDeviceVulkan12Features::default()
-        .timeline_semaphore(true)
-        .scalar_block_layout(true)
-        .host_query_reset(true);
-    let vulkan13 = vk::PhysicalDeviceVulkan13Features::default()
-        .synchronization2(true)
-        .subgroup_size_control(true)
-        .compute_full_subgroups(true);
-    (vulkan12, vulkan13)
-}
-
 impl Supported {
     pub(super) fn check(&self) -> Result<()> {
         self.missing().map_or(Ok(()), |requirement| {
@@ -146,6 +125,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     use super::*;
+    use crate::gpu::device::own_features;
     use crate::gpu::subgroups::SubgroupSizes;
 
     /// A device that meets every requirement and no more.
@@ -158,7 +138,7 @@ mod tests {
         for (to, from) in properties.device_name.iter_mut().zip(b"Abacus 3000") {
             *to = *from as _;
         }
-        let (vulkan12, vulkan13) = required_device_features();
+        let (vulkan12, vulkan13) = own_features();
         Supported {
             properties,
             subgroups: SubgroupSizes {
@@ -186,7 +166,7 @@ mod tests {
     #[test]
     fn each_missing_requirement_is_the_one_that_is_named() {
         type Break = (&'static str, fn(&mut Supported));
-        let breaks: [Break; 13] = [
+        let breaks: [Break; 12] = [
             ("Vulkan 1.3", |o| o.properties.api_version = vk::API_VERSION_1_2),
             ("compute queue", |o| o.compute_family = None),
             ("maxPerStageDescriptorStorageBuffers >= 12", |o| {
@@ -194,7 +174,6 @@ mod tests {
             }),
             ("timelineSemaphore", |o| o.vulkan12.timeline_semaphore = vk::FALSE),
             ("scalarBlockLayout", |o| o.vulkan12.scalar_block_layout = vk::FALSE),
-            ("hostQueryReset", |o| o.vulkan12.host_query_reset = vk::FALSE),
             ("synchronization2", |o| o.vulkan13.synchronization2 = vk::FALSE),
             ("subgroupSizeControl", |o| o.vulkan13.subgroup_size_control = vk::FALSE),
             ("computeFullSubgroups", |o| o.vulkan13.compute_full_subgroups = vk::FALSE),

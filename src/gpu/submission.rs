@@ -148,8 +148,6 @@ impl Gpu {
         // SAFETY: the device is live; the pool is retired below whatever happens.
         let queries = unsafe { shared.device.create_query_pool(&info, shared.callbacks()) }
             .map_err(|result| shared.error("vkCreateQueryPool", result))?;
-        // SAFETY: the pool was just created.
-        unsafe { shared.device.reset_query_pool(queries, 0, MAX_TIMESTAMPS) };
         let timestamps = timestamps(queries);
         let times =
             self.record_and_submit(label, Some(timestamps), record).and_then(|(done, labels)| {

@@ -98,7 +98,7 @@ impl Model {
         };
         let sh_degree = parts.iter().map(|(part, _)| part.gaussians.shape.sh_degree).max();
         let count = parts.iter().map(|(part, _)| part.gaussians.count).sum();
-        let mut joined = Gaussians::zeros(count, sh_degree.unwrap_or_default());
+        let mut joined = Gaussians::try_zeros(count, sh_degree.unwrap_or_default())?;
         let mut at = 0;
         for (index, (part, pose)) in parts.iter().enumerate() {
             let refuse = |problem: &str| Err(Error::Usage(format!("model {index} {problem}")));

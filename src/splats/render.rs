@@ -396,8 +396,9 @@ impl Renderer {
         self.check_layout(layout)?;
         let (count, reserved) = (self.context_count() + layout.count, self.frame.splats.len());
         if count > reserved {
-            let problem =
-                format!("{count} Gaussians exceed the {reserved} that the renderer reserved");
+            let problem = format!(
+                "{count} Gaussians exceed the {reserved} that the renderer has; call `Renderer::reserve`"
+            );
             return Err(Error::Usage(problem));
         }
         Ok(())
@@ -439,7 +440,9 @@ impl Renderer {
             || (tiles.x * tiles.y) as usize > self.frame.tile_ranges.len()
         {
             let UVec2 { x: width, y: height } = patch.size;
-            let what = format!("a {width}x{height} image exceeds what the renderer reserved");
+            let what = format!(
+                "a {width}x{height} image exceeds what the renderer has; call `Renderer::reserve`"
+            );
             return Err(Error::Usage(what));
         }
         let kind = ProjectionKind { camera_model: model_number(&patch.camera.model), view_depths };

@@ -27,6 +27,8 @@ pub use facts::ModelFacts;
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
 use nightsplat_core::camera::TrainingFrame;
 
+use crate::{Error, Result};
+
 pub use crate::kernels::sh::MAX_SH_DEGREE;
 
 /// The constant basis function of the spherical harmonics, to eight digits: an ulp below the shaders'.
@@ -89,6 +91,24 @@ impl Gaussians {
     pub fn zeros(count: usize, shape: impl Into<Shape>) -> Self {
         let shape = shape.into();
         Self { count, shape, parameters: vec![0.0; count * width(shape)], origin: DVec3::ZERO }
+    }
+
+    /// [`Gaussians::zeros`] of a count from outside.
+    ///
+    /// # Errors
+    /// The host is out of memory.
+    #[doc(hidden)]
+    pub fn try_zeros(count: usize, shape: impl Into<Shape>) -> Result<Self> {
+        let shape = shape.into();
+        let floats = count.saturating_mul(width(shape));
+        let mut parameters = vec![];
+        parameters.try_reserve_exact(floats).map_err(|cause| Error::OutOfMemory {
+            buffer: "parameters".to_owned(),
+            bytes: floats.saturating_mul(size_of::<f32>()) as u64,
+            source: cause.into(),
+        })?;
+        parameters.resize(floats, 0.0);
+        Ok(Self { count, shape, parameters, origin: DVec3::ZERO })
     }
 
     /// The range of an attribute in [`Gaussians::parameters`].

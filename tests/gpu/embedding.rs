@@ -5,7 +5,7 @@
 use std::ffi::CStr;
 
 use ash::vk::Handle as _;
-use ash::{khr, vk};
+use ash::{ext, khr, vk};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, HostDevice, HostFrame};
 use nightsplat::splats::render::{RenderSettings, Renderer};
@@ -17,17 +17,35 @@ use crate::images::{OPTIONS, cameras, gaussians};
 #[test]
 fn a_borrowed_device_renders_the_same_and_is_returned_unchanged() {
     // A device without the extension has its descriptors in sets; the bits are the same.
-    lend_and_take_back(&[]);
+    lend_and_take_back(vk::API_VERSION_1_3, &[]);
     if gpu().properties().has_push_descriptors {
-        lend_and_take_back(&[khr::push_descriptor::NAME]);
+        lend_and_take_back(vk::API_VERSION_1_3, &[khr::push_descriptor::NAME]);
     }
 }
 
-fn lend_and_take_back(extensions: &[&CStr]) {
+#[test]
+fn instances_of_older_vulkan_do_with_the_extensions_that_became_vulkan_1_3() {
+    const SYNCHRONIZATION: &CStr = khr::synchronization2::NAME;
+    const SUBGROUPS: &CStr = ext::subgroup_size_control::NAME;
+    lend_and_take_back(vk::API_VERSION_1_2, &[SYNCHRONIZATION, SUBGROUPS]);
+    lend_and_take_back(
+        vk::API_VERSION_1_1,
+        &[
+            SYNCHRONIZATION,
+            SUBGROUPS,
+            khr::timeline_semaphore::NAME,
+            ext::scalar_block_layout::NAME,
+            khr::shader_float_controls::NAME,
+            khr::spirv_1_4::NAME,
+        ],
+    );
+}
+
+fn lend_and_take_back(version: u32, extensions: &'static [&'static CStr]) {
     let expected = render(&gpu());
     assert!(expected.data.iter().any(|&value| value > 0.5), "nothing is seen");
 
-    let host = Host::new(extensions);
+    let host = Host::of_version(version, extensions);
     let mut memory = host.memory(expected.data.len());
     host.fill(&memory, 0xcafe_f00d);
 

@@ -9,7 +9,7 @@ use ash::vk::Handle as _;
 use ash::{ext, khr, vk};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{
-    Gpu, HostDevice, HostImage, ImageFormat, ImageState, required_device_features,
+    FeatureStructs, Gpu, HostDevice, HostImage, ImageFormat, ImageState, require_features,
 };
 
 /// The host: instance, device and queue with validation, synchronization validation and best practices.
@@ -21,6 +21,7 @@ pub(crate) struct Host {
     messages: Box<Mutex<Vec<String>>>,
     physical: vk::PhysicalDevice,
     pub(crate) family: u32,
+    pub(crate) extensions: &'static [&'static CStr],
     pub(crate) device: ash::Device,
     pub(crate) queue: vk::Queue,
     pool: vk::CommandPool,
@@ -71,13 +72,18 @@ impl Memory {
 
 impl Host {
     /// With these device extensions.
-    pub(crate) fn new(extensions: &[&CStr]) -> Self {
+    pub(crate) fn new(extensions: &'static [&'static CStr]) -> Self {
+        Self::of_version(vk::API_VERSION_1_3, extensions)
+    }
+
+    /// Whose instance is of a Vulkan version.
+    pub(crate) fn of_version(version: u32, extensions: &'static [&'static CStr]) -> Self {
         let messages = Box::new(Mutex::new(vec![]));
         let messenger_info = messenger_info(&messages);
         // SAFETY: every create info points at live locals; the messages are boxed and outlive the instance.
         unsafe {
             let entry = ash::Entry::load().unwrap();
-            let instance = instance(&entry, messenger_info);
+            let instance = instance(&entry, version, messenger_info);
             let debug = ext::debug_utils::Instance::new(&entry, &instance);
             let messenger = debug.create_debug_utils_messenger(&messenger_info, None).unwrap();
             // The device that the other tests use.
@@ -92,7 +98,7 @@ impl Host {
             let does_both = vk::QueueFlags::COMPUTE | vk::QueueFlags::GRAPHICS;
             let suits = |f: &vk::QueueFamilyProperties| f.queue_flags.contains(does_both);
             let family = families.iter().position(suits).unwrap() as u32;
-            let device = device(&instance, physical, family, extensions);
+            let device = device(&instance, physical, family, version, extensions);
             let pool_info = vk::CommandPoolCreateInfo::default().queue_family_index(family);
             let mut kind =
                 vk::SemaphoreTypeCreateInfo::default().semaphore_type(vk::SemaphoreType::TIMELINE);
@@ -108,13 +114,14 @@ impl Host {
                 messages,
                 physical,
                 family,
+                extensions,
                 device,
             }
         }
     }
 
     /// The device as it is lent, queue included; the host tells of frames by its timeline.
-    pub(crate) fn lend(&self) -> HostDevice {
+    pub(crate) fn lend(&self) -> HostDevice<'static> {
         HostDevice {
             get_instance_proc_addr: self.entry.static_fn().get_instance_proc_addr as *const c_void,
             instance: self.instance.handle().as_raw(),
@@ -122,6 +129,7 @@ impl Host {
             device: self.device.handle().as_raw(),
             queue: self.queue.as_raw(),
             queue_family: self.family,
+            extensions: self.extensions,
             frames: self.timeline.as_raw(),
             names_objects: true,
             ..HostDevice::default()
@@ -134,7 +142,7 @@ impl Host {
     }
 
     /// The same without the queue.
-    pub(crate) fn lend_to_record(&self) -> HostDevice {
+    pub(crate) fn lend_to_record(&self) -> HostDevice<'static> {
         HostDevice { queue: 0, is_record_only: true, ..self.lend() }
     }
 
@@ -472,9 +480,10 @@ pub(crate) fn vulkan(format: ImageFormat) -> vk::Format {
 /// The messages that `messenger_info` points at outlive the instance.
 unsafe fn instance(
     entry: &ash::Entry,
+    version: u32,
     mut messenger_info: vk::DebugUtilsMessengerCreateInfoEXT<'_>,
 ) -> ash::Instance {
-    let app = vk::ApplicationInfo::default().api_version(vk::API_VERSION_1_3);
+    let app = vk::ApplicationInfo::default().api_version(version);
     let layers = [c"VK_LAYER_KHRONOS_validation".as_ptr()];
     let extensions = [ext::debug_utils::NAME.as_ptr(), ext::validation_features::NAME.as_ptr()];
     let checks = [
@@ -498,6 +507,7 @@ unsafe fn device(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
     family: u32,
+    version: u32,
     extensions: &[&CStr],
 ) -> ash::Device {
     let priorities = [1.0];
@@ -505,15 +515,20 @@ unsafe fn device(
         .queue_family_index(family)
         .queue_priorities(&priorities)];
     let extensions: Vec<_> = extensions.iter().map(|name| name.as_ptr()).collect();
-    let (mut vulkan12, vulkan13) = required_device_features();
-    let mut vulkan13 = vulkan13.dynamic_rendering(true);
-    let info = vk::DeviceCreateInfo::default()
+    let mut rendering =
+        vk::PhysicalDeviceDynamicRenderingFeatures::default().dynamic_rendering(true);
+    let mut info = vk::DeviceCreateInfo::default()
         .queue_create_infos(&queues)
-        .enabled_extension_names(&extensions)
-        .push_next(&mut vulkan12)
-        .push_next(&mut vulkan13);
+        .enabled_extension_names(&extensions);
+    if version >= vk::API_VERSION_1_3 {
+        info = info.push_next(&mut rendering);
+    }
+    let mut structs = FeatureStructs::default();
     // SAFETY: `info` points at live locals.
-    unsafe { instance.create_device(physical, &info, None) }.unwrap()
+    unsafe {
+        require_features((&raw mut info).cast(), &mut structs, &[]);
+        instance.create_device(physical, &info, None).unwrap()
+    }
 }
 
 /// Extensions that make recording faster, where the device has them.

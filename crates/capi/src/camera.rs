@@ -1,15 +1,20 @@
 //! Cameras: a pinhole's numbers, also from the matrices of an engine.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
-use nightsplat_core::camera::{Camera, CameraModel};
+use nightsplat_core::camera::{Camera, CameraModel, KannalaBrandt, deviation_from_rigid};
 
 use super::error::{Failure, NspResult, guard};
-use super::structs::object_mut;
+use super::structs::{Sized0, write};
 
-/// A pinhole camera, in axes x right, y down, z forward.
+/// The lens is a fisheye (Kannala and Brandt); otherwise the camera is a pinhole.
+pub const NSP_CAMERA_FISHEYE: u32 = 1;
+
+/// A camera, in axes x right, y down, z forward.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspCamera {
+    /// `sizeof(NspCamera)`; in an array, the distance between elements.
+    pub struct_size: usize,
     /// Width in pixels.
     pub width: u32,
     /// Height in pixels.
@@ -20,19 +25,33 @@ pub struct NspCamera {
     pub principal_point: [f64; 2],
     /// The rigid transform from world to view space, three rows of four.
     pub view_from_world: [f64; 12],
+    /// `NSP_CAMERA_*`.
+    pub flags: u32,
+    /// Unused.
+    pub reserved: u32,
+    /// With `NSP_CAMERA_FISHEYE`: k1 to k4 of OpenCV's fisheye model.
+    pub distortion: [f64; 4],
 }
 
-impl From<&NspCamera> for Camera {
-    fn from(camera: &NspCamera) -> Self {
-        let NspCamera { width, height, focal, principal_point, view_from_world: m } = *camera;
-        Self {
-            width,
-            height,
-            focal: DVec2::from(focal),
-            principal_point: DVec2::from(principal_point),
-            model: CameraModel::Pinhole,
-            view_from_world: affine(&m),
+// SAFETY: the size comes first; the rest are numbers.
+unsafe impl Sized0 for NspCamera {
+    const NAME: &'static str = "NspCamera";
+    const FIRST_SIZE: usize = size_of::<Self>();
+}
+
+impl NspCamera {
+    /// The camera, as the library has it.
+    pub fn camera(&self) -> Result<Camera, String> {
+        let Self { width, height, focal, principal_point, view_from_world: m, .. } = *self;
+        if self.flags & !NSP_CAMERA_FISHEYE != 0 || self.reserved != 0 {
+            return Err("has unknown flags, or reserved is not 0".to_owned());
         }
+        let model = match self.flags & NSP_CAMERA_FISHEYE {
+            0 => CameraModel::Pinhole,
+            _ => CameraModel::Fisheye(KannalaBrandt { coefficients: self.distortion }),
+        };
+        let (focal, principal_point) = (DVec2::from(focal), DVec2::from(principal_point));
+        Ok(Camera { width, height, focal, principal_point, model, view_from_world: affine(&m) })
     }
 }
 
@@ -46,10 +65,10 @@ pub(super) fn affine(m: &[f64; 12]) -> DAffine3 {
 /// depth 0 to 1, or reversed). The camera may look along z or -z, with y up or down. `width` and `height` are those of
 /// the viewport in pixels.
 ///
-/// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared.
+/// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared, or if the matrices scale or mirror the world.
 ///
 /// # Safety
-/// `view` and `projection` are NULL or hold 16 floats; `camera` is NULL or valid.
+/// `view` and `projection` are NULL or hold 16 floats; `camera` is NULL or valid, with its `struct_size`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nsp_camera_from_matrices(
     view: *const f32,
@@ -63,12 +82,11 @@ pub unsafe extern "C" fn nsp_camera_from_matrices(
             return Err(Failure::usage("view or projection is NULL"));
         }
         // SAFETY: as the caller promises.
-        let (view, projection, camera) = unsafe {
-            let matrix = |m: *const f32| std::slice::from_raw_parts(m, 16);
-            (matrix(view), matrix(projection), object_mut(camera, "camera")?)
-        };
-        *camera = from_matrices(view, projection, [width, height])?;
-        Ok(())
+        let [view, projection] =
+            [view, projection].map(|m| unsafe { std::slice::from_raw_parts(m, 16) });
+        let made = from_matrices(view, projection, [width, height])?;
+        // SAFETY: as the caller promises.
+        unsafe { write(camera, &made) }
     })
 }
 
@@ -105,11 +123,33 @@ fn from_matrices(
     for (at, value) in view_from_world.iter_mut().enumerate() {
         *value = v(at / 4, at % 4);
     }
+    check_pose(&affine(&view_from_world))?;
     Ok(NspCamera {
+        struct_size: size_of::<NspCamera>(),
         width,
         height,
         focal: (scale.abs() * half).to_array(),
         principal_point: ((middle + 1.0) * half).to_array(),
         view_from_world,
+        flags: 0,
+        reserved: 0,
+        distortion: [0.0; 4],
     })
+}
+
+/// Refuses a view that mirrors or scales, with what to do about it.
+fn check_pose(view_from_world: &DAffine3) -> Result<(), Failure> {
+    let determinant = view_from_world.matrix3.determinant();
+    if determinant < 0.0 {
+        return Err(Failure::usage(
+            "view and projection mirror the world; negate projection[5] for a clip space with y down, or column 2 of \
+             the view for a left-handed engine",
+        ));
+    }
+    match deviation_from_rigid(view_from_world) {
+        None => Ok(()),
+        Some(_) => Err(Failure::usage(format!(
+            "view is no rigid transform, its determinant is {determinant:.4}; divide its scale out"
+        ))),
+    }
 }

@@ -3,20 +3,20 @@
 use std::ffi::{CStr, c_char, c_void};
 
 use ash::vk;
+use ash::vk::Handle as _;
 pub use ash::vk::{
-    Device as VkDevice, DeviceMemory as VkDeviceMemory, DeviceSize as VkDeviceSize,
-    Instance as VkInstance, MemoryPropertyFlags as VkMemoryPropertyFlags,
-    MemoryRequirements as VkMemoryRequirements, PhysicalDevice as VkPhysicalDevice,
-    PipelineCache as VkPipelineCache, Queue as VkQueue, Result as VkResult,
-    Semaphore as VkSemaphore,
+    CommandBuffer as VkCommandBuffer, Device as VkDevice, DeviceMemory as VkDeviceMemory,
+    DeviceSize as VkDeviceSize, Instance as VkInstance,
+    MemoryPropertyFlags as VkMemoryPropertyFlags, MemoryRequirements as VkMemoryRequirements,
+    PhysicalDevice as VkPhysicalDevice, PipelineCache as VkPipelineCache, Queue as VkQueue,
+    Result as VkResult, Semaphore as VkSemaphore,
 };
-use ash::vk::{Handle as _, TaggedStructure as _};
 
-use super::error::{Failure, NSP_ERROR_DEVICE, NspResult, Object, guard};
+use super::error::{Failure, NSP_ERROR_VERSION, NspResult, Object, guard};
 use super::structs::{Sized0, destroy, give, object, read, text};
 use nightsplat::gpu::{
-    DeviceChoice, Gpu, HostAllocation, HostDevice, MemoryFunctions, QueueLock,
-    check_physical_device, required_device_features,
+    DeviceChoice, FeatureStructs, Gpu, HostAllocation, HostDevice, HostFrame, HostRequirements,
+    MemoryFunctions, QueueLock, check_physical_device, require_features,
 };
 
 /// Vulkan's.
@@ -24,9 +24,17 @@ pub type VkAllocationCallbacks = vk::AllocationCallbacks<'static>;
 /// Vulkan's.
 pub type VkPhysicalDeviceFeatures2 = vk::PhysicalDeviceFeatures2<'static>;
 /// Vulkan's.
-pub type VkPhysicalDeviceVulkan12Features = vk::PhysicalDeviceVulkan12Features<'static>;
+pub type VkPhysicalDeviceTimelineSemaphoreFeatures =
+    vk::PhysicalDeviceTimelineSemaphoreFeatures<'static>;
 /// Vulkan's.
-pub type VkPhysicalDeviceVulkan13Features = vk::PhysicalDeviceVulkan13Features<'static>;
+pub type VkPhysicalDeviceScalarBlockLayoutFeatures =
+    vk::PhysicalDeviceScalarBlockLayoutFeatures<'static>;
+/// Vulkan's.
+pub type VkPhysicalDeviceSynchronization2Features =
+    vk::PhysicalDeviceSynchronization2Features<'static>;
+/// Vulkan's.
+pub type VkPhysicalDeviceSubgroupSizeControlFeatures =
+    vk::PhysicalDeviceSubgroupSizeControlFeatures<'static>;
 #[allow(non_camel_case_types, reason = "Vulkan's own name")]
 /// Vulkan's.
 pub type PFN_vkGetInstanceProcAddr = Option<vk::PFN_vkGetInstanceProcAddr>;
@@ -64,10 +72,12 @@ pub struct NspMemory {
     pub cookie: *mut c_void,
 }
 
-/// The host's allocator of device memory. It may be called from any thread.
+/// The host's allocator of device memory. It may be called from any thread, and must not throw.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspMemoryFunctions {
+    /// `sizeof(NspMemoryFunctions)`.
+    pub struct_size: usize,
     /// Writes to `out` memory that has all `required` properties and, if there is such memory, all `preferred` ones.
     pub allocate: Option<
         unsafe extern "C" fn(
@@ -85,12 +95,21 @@ pub struct NspMemoryFunctions {
     pub user: *mut c_void,
 }
 
+// SAFETY: the size comes first; null functions are zeros.
+unsafe impl Sized0 for NspMemoryFunctions {
+    const NAME: &'static str = "NspMemoryFunctions";
+    const FIRST_SIZE: usize = size_of::<Self>();
+}
+
 /// The library submits nothing: uploads are part of the next recording, and training is refused.
 pub const NSP_DEVICE_RECORD_ONLY: u32 = 1;
 /// The queue is internally synchronized (`VK_KHR_internally_synchronized_queues`): no lock is taken.
 pub const NSP_DEVICE_QUEUE_SYNCHRONIZED: u32 = 2;
 /// `VK_EXT_debug_utils` is enabled on the instance: objects are named, and passes are labelled.
 pub const NSP_DEVICE_NAMES_OBJECTS: u32 = 4;
+
+const FLAGS: u32 =
+    NSP_DEVICE_RECORD_ONLY | NSP_DEVICE_QUEUE_SYNCHRONIZED | NSP_DEVICE_NAMES_OBJECTS;
 
 /// A device that the host lends. It outlives everything that is made with it.
 #[repr(C)]
@@ -100,7 +119,9 @@ pub struct NspHostDevice {
     pub struct_size: usize,
     /// The function of the host's Vulkan loader.
     pub get_instance_proc_addr: PFN_vkGetInstanceProcAddr,
-    /// An instance of Vulkan 1.3 or later.
+    /// An instance of Vulkan 1.1 or later. Below 1.3, the device has `VK_KHR_synchronization2` and
+    /// `VK_EXT_subgroup_size_control`; at 1.1, also `VK_KHR_timeline_semaphore`, `VK_EXT_scalar_block_layout` and
+    /// `VK_KHR_spirv_1_4`.
     pub instance: VkInstance,
     /// A physical device of the instance.
     pub physical_device: VkPhysicalDevice,
@@ -116,7 +137,7 @@ pub struct NspHostDevice {
     pub extensions: *const *const c_char,
     /// The number of extensions.
     pub extension_count: u32,
-    /// The enabled features; NULL: those of `nsp_require_features`.
+    /// The enabled features, with what is chained to it; NULL: those of `nsp_require_features`.
     pub features: *const VkPhysicalDeviceFeatures2,
     /// Locks the queue around each `vkQueueSubmit2`; set both functions, or none.
     pub lock_queue: Option<unsafe extern "C" fn(user: *mut c_void, queue: VkQueue)>,
@@ -140,29 +161,57 @@ unsafe impl Sized0 for NspHostDevice {
     const FIRST_SIZE: usize = size_of::<Self>();
 }
 
-/// Enables the features that the library needs in the structs with which the host creates its device; clears none.
+/// The structs that `nsp_require_features` chains where the host has none. They stay where they are until the device is
+/// created.
+#[repr(C)]
+#[derive(Debug)]
+pub struct NspFeatureStructs {
+    /// `sizeof(NspFeatureStructs)`.
+    pub struct_size: usize,
+    /// Chained by the library, as all below.
+    pub timeline_semaphore: VkPhysicalDeviceTimelineSemaphoreFeatures,
+    /// Chained by the library.
+    pub scalar_block_layout: VkPhysicalDeviceScalarBlockLayoutFeatures,
+    /// Chained by the library.
+    pub synchronization2: VkPhysicalDeviceSynchronization2Features,
+    /// Chained by the library.
+    pub subgroup_size_control: VkPhysicalDeviceSubgroupSizeControlFeatures,
+}
+
+/// Enables the features that the library needs in the chain with which the host creates its device. `chain` is the
+/// host's `VkDeviceCreateInfo` or `VkPhysicalDeviceFeatures2`. Each feature is enabled in the struct of the chain that
+/// has it, of a Vulkan version or of an extension; for the others, structs of `structs` are appended.
 ///
 /// # Safety
-/// Each is NULL or valid.
+/// `chain` is NULL or a valid chain; `structs` is NULL or valid, and outlives the chain.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nsp_require_features(
-    vulkan12: *mut VkPhysicalDeviceVulkan12Features,
-    vulkan13: *mut VkPhysicalDeviceVulkan13Features,
-) {
-    let (needed12, needed13) = required_device_features();
-    // SAFETY: as the caller promises.
-    let (vulkan12, vulkan13) = unsafe { (vulkan12.as_mut(), vulkan13.as_mut()) };
-    if let Some(features) = vulkan12 {
-        features.timeline_semaphore |= needed12.timeline_semaphore;
-        features.scalar_block_layout |= needed12.scalar_block_layout;
-        features.host_query_reset |= needed12.host_query_reset;
-    }
-    if let Some(features) = vulkan13 {
-        features.synchronization2 |= needed13.synchronization2;
-        features.subgroup_size_control |= needed13.subgroup_size_control;
-        features.compute_full_subgroups |= needed13.compute_full_subgroups;
-    }
+    chain: *mut c_void,
+    structs: *mut NspFeatureStructs,
+) -> NspResult {
+    guard("nsp_require_features", || {
+        if chain.is_null() {
+            return Err(Failure::usage("chain is NULL; pass the VkDeviceCreateInfo"));
+        }
+        // SAFETY: as the caller promises; the members after the size are those of `FeatureStructs`.
+        unsafe {
+            object(structs, "structs")?;
+            if (*structs).struct_size < size_of::<NspFeatureStructs>() {
+                let text = "NspFeatureStructs::struct_size is too small; set it to its sizeof";
+                return Err(Failure::new(NSP_ERROR_VERSION, text));
+            }
+            let first = (&raw mut (*structs).timeline_semaphore).cast::<FeatureStructs>();
+            first.write(FeatureStructs::default());
+            require_features(chain, &mut *first, &[]);
+        }
+        Ok(())
+    })
 }
+
+const _: () = {
+    let members = std::mem::offset_of!(NspFeatureStructs, timeline_semaphore);
+    assert!(size_of::<FeatureStructs>() == size_of::<NspFeatureStructs>() - members);
+};
 
 struct Names([*const c_char; 1]);
 // SAFETY: the pointers are to static text.
@@ -193,13 +242,16 @@ pub unsafe extern "C" fn nsp_check_device(
     physical_device: VkPhysicalDevice,
 ) -> NspResult {
     guard("nsp_check_device", || {
-        let function = get_instance_proc_addr
-            .ok_or_else(|| Failure::usage("get_instance_proc_addr is NULL"))?;
-        not_null("instance", instance)?;
-        not_null("physical_device", physical_device)?;
+        let function = address(get_instance_proc_addr);
+        let instance = not_null("instance", instance)?.as_raw();
+        let physical_device = not_null("physical_device", physical_device)?.as_raw();
         // SAFETY: as the caller promises.
         Ok(unsafe { check_physical_device(function, instance, physical_device) }?)
     })
+}
+
+fn address(function: PFN_vkGetInstanceProcAddr) -> *const c_void {
+    function.map_or(std::ptr::null(), |function| function as *const c_void)
 }
 
 fn not_null<H: vk::Handle + Copy>(name: &str, handle: H) -> Result<H, Failure> {
@@ -222,7 +274,9 @@ pub unsafe extern "C" fn nsp_device_from_host(
         // SAFETY: as the caller promises.
         unsafe {
             give(device, "device", || {
-                let lent = lent(&read(host)?)?;
+                let host = read(host)?;
+                let extensions = extensions(&host)?;
+                let lent = lent(&host, &extensions)?;
                 Ok(NspDevice(Object::new(Gpu::from_host(lent)?)))
             })
         }
@@ -231,20 +285,38 @@ pub unsafe extern "C" fn nsp_device_from_host(
 
 /// # Safety
 /// `host` says the truth.
-unsafe fn lent(host: &NspHostDevice) -> Result<HostDevice, Failure> {
+unsafe fn lent<'a>(
+    host: &NspHostDevice,
+    extensions: &'a [&'a CStr],
+) -> Result<HostDevice<'a>, Failure> {
     let member = |name: &str| format!("NspHostDevice::{name}");
-    let get_instance_proc_addr = host
-        .get_instance_proc_addr
-        .ok_or_else(|| Failure::usage(format!("{} is NULL", member("get_instance_proc_addr"))))?;
+    if host.get_instance_proc_addr.is_none() {
+        return Err(Failure::usage(format!("{} is NULL", member("get_instance_proc_addr"))));
+    }
     not_null(&member("instance"), host.instance)?;
     not_null(&member("physical_device"), host.physical_device)?;
     not_null(&member("device"), host.device)?;
+    if host.flags & !FLAGS != 0 {
+        let flags = host.flags & !FLAGS;
+        return Err(Failure::usage(format!(
+            "NspHostDevice::flags has the unknown bits {flags:#x}"
+        )));
+    }
     let is_record_only = host.flags & NSP_DEVICE_RECORD_ONLY != 0;
     if !is_record_only {
         not_null(&member("queue"), host.queue)?;
     }
     let queue_lock = match (host.lock_queue, host.unlock_queue) {
-        (Some(lock), Some(unlock)) => Some(QueueLock { lock, unlock, user: host.user }),
+        (Some(lock), Some(unlock)) => {
+            // SAFETY: a queue is a pointer, under both of its names.
+            let [lock, unlock] = [lock, unlock].map(|function| unsafe {
+                std::mem::transmute::<
+                    unsafe extern "C" fn(*mut c_void, VkQueue),
+                    unsafe extern "C" fn(*mut c_void, *mut c_void),
+                >(function)
+            });
+            Some(QueueLock { lock, unlock, user: host.user })
+        }
         (None, None) => None,
         _ => {
             let text =
@@ -253,26 +325,23 @@ unsafe fn lent(host: &NspHostDevice) -> Result<HostDevice, Failure> {
         }
     };
     let is_synchronized = host.flags & NSP_DEVICE_QUEUE_SYNCHRONIZED != 0;
-    // SAFETY: as the caller promises.
-    let (extensions, device_memory) = unsafe {
-        check_features(host.features)?;
-        (extensions(host)?, memory_functions(host.device_memory)?)
-    };
     Ok(HostDevice {
-        get_instance_proc_addr: get_instance_proc_addr as *const c_void,
+        get_instance_proc_addr: address(host.get_instance_proc_addr),
         instance: host.instance.as_raw(),
         physical_device: host.physical_device.as_raw(),
         device: host.device.as_raw(),
         queue: host.queue.as_raw(),
         queue_family: host.queue_family,
         is_record_only,
-        has_push_descriptors: extensions.contains(&ash::khr::push_descriptor::NAME),
+        extensions,
+        features: host.features.cast(),
         names_objects: host.flags & NSP_DEVICE_NAMES_OBJECTS != 0,
         queue_lock: queue_lock.filter(|_| !is_synchronized),
         frames: host.frames.as_raw(),
         pipeline_cache: host.pipeline_cache.as_raw(),
         host_memory: host.host_memory.cast(),
-        device_memory,
+        // SAFETY: as the caller promises.
+        device_memory: unsafe { memory_functions(host.device_memory) }?,
     })
 }
 
@@ -306,12 +375,12 @@ type AllocateOfC = unsafe extern "C" fn(
 ) -> VkResult;
 type Allocate = unsafe extern "C" fn(
     *mut c_void,
-    *const vk::MemoryRequirements,
-    vk::MemoryPropertyFlags,
-    vk::MemoryPropertyFlags,
+    *const HostRequirements,
+    u32,
+    u32,
     *const c_char,
     *mut HostAllocation,
-) -> vk::Result;
+) -> i32;
 type FreeOfC = unsafe extern "C" fn(*mut c_void, *const NspMemory);
 type Free = unsafe extern "C" fn(*mut c_void, *const HostAllocation);
 
@@ -320,13 +389,17 @@ type Free = unsafe extern "C" fn(*mut c_void, *const HostAllocation);
 unsafe fn memory_functions(
     functions: *const NspMemoryFunctions,
 ) -> Result<Option<MemoryFunctions>, Failure> {
+    if functions.is_null() {
+        return Ok(None);
+    }
     // SAFETY: as the caller promises.
-    let Some(functions) = (unsafe { functions.as_ref() }) else { return Ok(None) };
+    let functions = unsafe { read(functions) }?;
     let (Some(allocate), Some(free)) = (functions.allocate, functions.free) else {
         let text = "NspHostDevice::device_memory needs both allocate and free";
         return Err(Failure::usage(text));
     };
-    // SAFETY: `NspMemory` and `HostAllocation` have the same members in the same order.
+    // SAFETY: `NspMemory` and `HostAllocation`, `VkMemoryRequirements` and `HostRequirements` have the same members in
+    // the same order; flags and results are 32-bit numbers.
     let (allocate, free) = unsafe {
         (
             std::mem::transmute::<AllocateOfC, Allocate>(allocate),
@@ -334,59 +407,6 @@ unsafe fn memory_functions(
         )
     };
     Ok(Some(MemoryFunctions { allocate, free, user: functions.user }))
-}
-
-/// Refuses a chain of enabled features without one that is needed.
-///
-/// # Safety
-/// NULL, or a valid chain.
-unsafe fn check_features(features: *const VkPhysicalDeviceFeatures2) -> Result<(), Failure> {
-    if features.is_null() {
-        return Ok(());
-    }
-    let mut enabled12 = vk::PhysicalDeviceVulkan12Features::default();
-    let mut enabled13 = vk::PhysicalDeviceVulkan13Features::default();
-    let mut next = features.cast::<vk::BaseInStructure<'_>>();
-    // SAFETY: each struct begins with its type, which says what it is, and the next of the chain.
-    while let Some(base) = unsafe { next.as_ref() } {
-        macro_rules! add {
-            ($enabled:ident, $of:ident: $($feature:ident),+) => {
-                if base.s_type == vk::$of::STRUCTURE_TYPE {
-                    // SAFETY: it is of this type.
-                    let features = unsafe { &*next.cast::<vk::$of<'_>>() };
-                    $($enabled.$feature |= features.$feature;)+
-                }
-            };
-        }
-        add!(enabled12, PhysicalDeviceVulkan12Features:
-            timeline_semaphore, scalar_block_layout, host_query_reset);
-        add!(enabled12, PhysicalDeviceTimelineSemaphoreFeatures: timeline_semaphore);
-        add!(enabled12, PhysicalDeviceScalarBlockLayoutFeatures: scalar_block_layout);
-        add!(enabled12, PhysicalDeviceHostQueryResetFeatures: host_query_reset);
-        add!(enabled13, PhysicalDeviceVulkan13Features:
-            synchronization2, subgroup_size_control, compute_full_subgroups);
-        add!(enabled13, PhysicalDeviceSynchronization2Features: synchronization2);
-        add!(enabled13, PhysicalDeviceSubgroupSizeControlFeatures:
-            subgroup_size_control, compute_full_subgroups);
-        next = base.p_next;
-    }
-    let required = [
-        ("timelineSemaphore", enabled12.timeline_semaphore),
-        ("scalarBlockLayout", enabled12.scalar_block_layout),
-        ("hostQueryReset", enabled12.host_query_reset),
-        ("synchronization2", enabled13.synchronization2),
-        ("subgroupSizeControl", enabled13.subgroup_size_control),
-        ("computeFullSubgroups", enabled13.compute_full_subgroups),
-    ];
-    match required.iter().find(|(_, enabled)| *enabled == vk::FALSE) {
-        Some((name, _)) => Err(Failure::new(
-            NSP_ERROR_DEVICE,
-            format!(
-                "NspHostDevice::features lacks {name}; create the device with nsp_require_features"
-            ),
-        )),
-        None => Ok(()),
-    }
 }
 
 /// Opens a device of the library's own, for training without a host's. `choice` is a value of `nightsplat --device`;
@@ -411,7 +431,29 @@ pub unsafe extern "C" fn nsp_device_open(
     })
 }
 
-/// Reports that all frames up to `frame` are done or were never submitted, and frees what they used. `UINT64_MAX`
+/// Records the uploads that wait, and nothing else, so that a loading screen or a transfer needs no picture. `commands`
+/// and `frame` are as in `NspRender`.
+///
+/// # Safety
+/// `device` is NULL or valid; `commands` is recording on the lent queue family, outside a render pass.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nsp_record_uploads(
+    device: *mut NspDevice,
+    commands: VkCommandBuffer,
+    frame: u64,
+) -> NspResult {
+    guard("nsp_record_uploads", || {
+        // SAFETY: as the caller promises.
+        let gpu = unsafe { object(device, "device") }?.0.get("the device")?;
+        let commands = not_null("commands", commands)?.as_raw();
+        // SAFETY: as the caller promises.
+        unsafe { gpu.record_into(&HostFrame { commands, number: frame, readers: 0 }, |_| Ok(())) }?;
+        Ok(())
+    })
+}
+
+/// Reports that all frames up to `frame` are done or were never submitted, and frees what they used. Uploads of a
+/// recording that was never submitted are part of the next one. `UINT64_MAX`
 /// stands for all frames, also after the device was lost.
 ///
 /// # Safety

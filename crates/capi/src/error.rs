@@ -71,7 +71,32 @@ impl Failure {
 impl From<Error> for Failure {
     fn from(error: Error) -> Self {
         let cause = std::error::Error::source(&error).map(|cause| format!(" ({cause})"));
-        Self { code: code(&error), text: format!("{error}{}", cause.unwrap_or_default()) }
+        let text = format!("{}{}", host_text(&error), cause.unwrap_or_default());
+        Self { code: code(&error), text }
+    }
+}
+
+/// The text of an error whose remedy is a host's, not the command's.
+fn host_text(error: &Error) -> String {
+    match error {
+        Error::MissingFeature { device, feature } => {
+            format!("{device} lacks {feature}; take another physical device")
+        }
+        Error::SelfTest { device, what, .. } => {
+            format!(
+                "{device} fails the self-test: {what}; update the driver or take another device"
+            )
+        }
+        Error::Kernel { device, problem, kernel, .. } => format!(
+            "{device} {problem} kernel `{kernel}`; update the driver or take another device"
+        ),
+        Error::OutOfMemory { buffer, bytes, .. } => format!(
+            "out of memory: `{buffer}` needs {bytes} bytes; draw fewer Gaussians or a smaller view"
+        ),
+        Error::BufferTooLarge { buffer, bytes, device, limit } => format!(
+            "`{buffer}` needs {bytes} bytes, {device} binds {limit} at most; draw fewer Gaussians or a smaller view"
+        ),
+        other => other.to_string(),
     }
 }
 

@@ -4,11 +4,11 @@ use std::ffi::c_char;
 
 use super::camera::affine;
 use super::device::NspDevice;
-use super::error::{Failure, NspResult, Object, guard};
+use super::error::{Failure, NSP_ERROR_MEMORY, NSP_ERROR_NOT_FINITE, NspResult, Object, guard};
 use super::structs::{Sized0, destroy, give, object, text, write};
 use nightsplat::gpu::Gpu;
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::{DeviceGaussians, Gaussians};
+use nightsplat::splats::scene::{DeviceGaussians, Gaussians, width};
 
 /// A model on a device. Use it from one thread at a time.
 #[derive(Debug)]
@@ -103,7 +103,7 @@ pub unsafe extern "C" fn nsp_model_create(
         unsafe {
             give(model, "model", || {
                 let gpu = object(device, "device")?.0.get("the device")?;
-                NspModel::new(gpu, gathered(count, sh_degree, planes)?.into())
+                NspModel::new(gpu, gathered(gpu, count, sh_degree, planes)?.into())
             })
         }
     })
@@ -112,6 +112,7 @@ pub unsafe extern "C" fn nsp_model_create(
 /// # Safety
 /// As [`nsp_model_create`].
 unsafe fn gathered(
+    gpu: &Gpu,
     count: u32,
     sh_degree: u32,
     planes: *const *const f32,
@@ -122,21 +123,33 @@ unsafe fn gathered(
     if planes.is_null() {
         return Err(Failure::usage("planes is NULL"));
     }
-    let mut gaussians = Gaussians::zeros(count as usize, sh_degree);
+    let used = if sh_degree == 0 { PLANES.len() - 1 } else { PLANES.len() };
+    // SAFETY: as the caller promises.
+    if let Some(at) = (0..used).find(|&at| count > 0 && unsafe { *planes.add(at) }.is_null()) {
+        return Err(Failure::usage(format!("plane {at}, {}, is NULL", PLANES[at])));
+    }
+    let bytes = u64::from(count) * (size_of::<f32>() * width(sh_degree)) as u64;
+    let most = gpu.properties().max_buffer_size;
+    if bytes > most {
+        return Err(Failure::new(
+            NSP_ERROR_MEMORY,
+            format!(
+                "{count} Gaussians take {bytes} bytes, a buffer of the device {most}; pass fewer"
+            ),
+        ));
+    }
+    let mut gaussians = Gaussians::try_zeros(count as usize, sh_degree)?;
     let fill = |at: usize, values: &mut [f32]| {
-        // SAFETY: as the caller promises.
-        let plane = unsafe { *planes.add(at) };
         if values.is_empty() {
             return Ok(());
         }
-        if plane.is_null() {
-            return Err(Failure::usage(format!("plane {at}, {}, is NULL", PLANES[at])));
-        }
+        // SAFETY: as the caller promises.
+        let plane = unsafe { *planes.add(at) };
         // SAFETY: as the caller promises.
         values.copy_from_slice(unsafe { std::slice::from_raw_parts(plane, values.len()) });
         match values.iter().position(|x| !x.is_finite()) {
             Some(index) => Err(Failure::new(
-                super::error::NSP_ERROR_NOT_FINITE,
+                NSP_ERROR_NOT_FINITE,
                 format!("number {index} of plane {at}, {}, is not finite", PLANES[at]),
             )),
             None => Ok(()),

@@ -23,6 +23,9 @@
 // `VK_EXT_debug_utils` is enabled on the instance: objects are named, and passes are labelled.
 #define NSP_DEVICE_NAMES_OBJECTS 4
 
+// The lens is a fisheye (Kannala and Brandt); otherwise the camera is a pinhole.
+#define NSP_CAMERA_FISHEYE 1
+
 // Blends over the contents of `color` instead of replacing them.
 #define NSP_RENDER_OVER 1
 
@@ -58,6 +61,21 @@ typedef struct NspTrainer NspTrainer;
 // 0 or more: success. Otherwise an error, whose message `nsp_last_error` returns.
 typedef int32_t NspResult;
 
+// The structs that `nsp_require_features` chains where the host has none. They stay where they are until the device is
+// created.
+typedef struct NspFeatureStructs {
+    // `sizeof(NspFeatureStructs)`.
+    size_t struct_size;
+    // Chained by the library, as all below.
+    VkPhysicalDeviceTimelineSemaphoreFeatures timeline_semaphore;
+    // Chained by the library.
+    VkPhysicalDeviceScalarBlockLayoutFeatures scalar_block_layout;
+    // Chained by the library.
+    VkPhysicalDeviceSynchronization2Features synchronization2;
+    // Chained by the library.
+    VkPhysicalDeviceSubgroupSizeControlFeatures subgroup_size_control;
+} NspFeatureStructs;
+
 // A range of device memory that the host allocated.
 typedef struct NspMemory {
     // The memory object.
@@ -70,8 +88,10 @@ typedef struct NspMemory {
     void *cookie;
 } NspMemory;
 
-// The host's allocator of device memory. It may be called from any thread.
+// The host's allocator of device memory. It may be called from any thread, and must not throw.
 typedef struct NspMemoryFunctions {
+    // `sizeof(NspMemoryFunctions)`.
+    size_t struct_size;
     // Writes to `out` memory that has all `required` properties and, if there is such memory, all `preferred` ones.
     VkResult (*allocate)(void *user,
                          const VkMemoryRequirements *requirements,
@@ -91,7 +111,9 @@ typedef struct NspHostDevice {
     size_t struct_size;
     // The function of the host's Vulkan loader.
     PFN_vkGetInstanceProcAddr get_instance_proc_addr;
-    // An instance of Vulkan 1.3 or later.
+    // An instance of Vulkan 1.1 or later. Below 1.3, the device has `VK_KHR_synchronization2` and
+    // `VK_EXT_subgroup_size_control`; at 1.1, also `VK_KHR_timeline_semaphore`, `VK_EXT_scalar_block_layout` and
+    // `VK_KHR_spirv_1_4`.
     VkInstance instance;
     // A physical device of the instance.
     VkPhysicalDevice physical_device;
@@ -107,7 +129,7 @@ typedef struct NspHostDevice {
     const char *const *extensions;
     // The number of extensions.
     uint32_t extension_count;
-    // The enabled features; NULL: those of `nsp_require_features`.
+    // The enabled features, with what is chained to it; NULL: those of `nsp_require_features`.
     const VkPhysicalDeviceFeatures2 *features;
     // Locks the queue around each `vkQueueSubmit2`; set both functions, or none.
     void (*lock_queue)(void *user, VkQueue queue);
@@ -125,8 +147,10 @@ typedef struct NspHostDevice {
     VkSemaphore frames;
 } NspHostDevice;
 
-// A pinhole camera, in axes x right, y down, z forward.
+// A camera, in axes x right, y down, z forward.
 typedef struct NspCamera {
+    // `sizeof(NspCamera)`; in an array, the distance between elements.
+    size_t struct_size;
     // Width in pixels.
     uint32_t width;
     // Height in pixels.
@@ -137,6 +161,12 @@ typedef struct NspCamera {
     double principal_point[2];
     // The rigid transform from world to view space, three rows of four.
     double view_from_world[12];
+    // `NSP_CAMERA_*`.
+    uint32_t flags;
+    // Unused.
+    uint32_t reserved;
+    // With `NSP_CAMERA_FISHEYE`: k1 to k4 of OpenCV's fisheye model.
+    double distortion[4];
 } NspCamera;
 
 // The properties of a model.
@@ -165,17 +195,24 @@ typedef struct NspModelInfo {
 typedef struct NspImageState {
     // The image layout.
     VkImageLayout layout;
-    // The queue family that owns the image; `VK_QUEUE_FAMILY_IGNORED`: ownership is not transferred.
+    // The queue family that owns the image; read if `is_owned`.
     uint32_t family;
     // The pipeline stages in which the host uses the image.
     VkPipelineStageFlags2 stages;
     // The host's accesses in these stages.
     VkAccessFlags2 access;
+    // 1: `family` owns the image, and if it is not the lent family, the library's half of the ownership transfer is
+    // recorded; 0: ownership is not transferred.
+    uint32_t is_owned;
+    // Unused.
+    uint32_t reserved;
 } NspImageState;
 
 // An array layer of an image: mip level 0, single-sampled. Its usage includes `TRANSFER_DST` if it is written, and
 // `TRANSFER_SRC` if it is read.
 typedef struct NspImage {
+    // `sizeof(NspImage)`.
+    size_t struct_size;
     // The image.
     VkImage image;
     // Its format.
@@ -184,10 +221,11 @@ typedef struct NspImage {
     VkExtent2D extent;
     // The array layer of the first camera.
     uint32_t layer;
+    // The number of array layers; 0 stands for 1.
+    uint32_t layers;
     // The state in which the host leaves the image.
     struct NspImageState before;
-    // The state after the render. If the queue families differ, the library's half of the ownership transfer is
-    // recorded.
+    // The state after the render.
     struct NspImageState after;
 } NspImage;
 
@@ -247,6 +285,8 @@ typedef struct NspStatus {
 
 // A training step.
 typedef struct NspStep {
+    // `sizeof(NspStep)`; of the first of an array, the distance between its elements.
+    size_t struct_size;
     // Counted from 1.
     uint64_t step;
     // The weighted sum of its loss terms.
@@ -307,8 +347,10 @@ uint32_t nsp_version(void);
 // warnings, 3 for information. This is the only global state.
 void nsp_set_log(void (*log)(void *user, int32_t level, const char *line), void *user);
 
-// Enables the features that the library needs in the structs with which the host creates its device; clears none.
-void nsp_require_features(VkPhysicalDeviceVulkan12Features *vulkan12, VkPhysicalDeviceVulkan13Features *vulkan13);
+// Enables the features that the library needs in the chain with which the host creates its device. `chain` is the
+// host's `VkDeviceCreateInfo` or `VkPhysicalDeviceFeatures2`. Each feature is enabled in the struct of the chain that
+// has it, of a Vulkan version or of an extension; for the others, structs of `structs` are appended.
+NspResult nsp_require_features(void *chain, struct NspFeatureStructs *structs);
 
 // The optional device extensions with which recording is faster, and their number.
 const char *const *nsp_device_extensions(uint32_t *count);
@@ -325,7 +367,12 @@ NspResult nsp_device_from_host(const struct NspHostDevice *host, struct NspDevic
 // NULL or empty: the best device.
 NspResult nsp_device_open(const char *choice, struct NspDevice **device);
 
-// Reports that all frames up to `frame` are done or were never submitted, and frees what they used. `UINT64_MAX`
+// Records the uploads that wait, and nothing else, so that a loading screen or a transfer needs no picture. `commands`
+// and `frame` are as in `NspRender`.
+NspResult nsp_record_uploads(struct NspDevice *device, VkCommandBuffer commands, uint64_t frame);
+
+// Reports that all frames up to `frame` are done or were never submitted, and frees what they used. Uploads of a
+// recording that was never submitted are part of the next one. `UINT64_MAX`
 // stands for all frames, also after the device was lost.
 NspResult nsp_frames_done(struct NspDevice *device, uint64_t frame);
 
@@ -336,7 +383,7 @@ void nsp_device_destroy(struct NspDevice *device);
 // depth 0 to 1, or reversed). The camera may look along z or -z, with y up or down. `width` and `height` are those of
 // the viewport in pixels.
 //
-// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared.
+// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared, or if the matrices scale or mirror the world.
 NspResult nsp_camera_from_matrices(const float *view,
                                    const float *projection,
                                    uint32_t width,

@@ -3,9 +3,8 @@
 use ash::vk;
 use ash::vk::Handle as _;
 pub use ash::vk::{
-    AccessFlags2 as VkAccessFlags2, CommandBuffer as VkCommandBuffer, Extent2D as VkExtent2D,
-    Format as VkFormat, Image as VkImage, ImageLayout as VkImageLayout,
-    PipelineStageFlags2 as VkPipelineStageFlags2,
+    AccessFlags2 as VkAccessFlags2, Extent2D as VkExtent2D, Format as VkFormat, Image as VkImage,
+    ImageLayout as VkImageLayout, PipelineStageFlags2 as VkPipelineStageFlags2,
 };
 use nightsplat::gpu::{Gpu, HostFrame, HostImage, ImageFormat, ImageState};
 use nightsplat::splats::render::{
@@ -15,10 +14,10 @@ use nightsplat::splats::render::{
 use nightsplat_core::camera::Camera;
 
 use super::camera::NspCamera;
-use super::device::NspDevice;
+use super::device::{NspDevice, VkCommandBuffer};
 use super::error::{Failure, NspResult, Object, guard};
 use super::model::{LoadedModel, NspModel};
-use super::structs::{Sized0, destroy, give, object, object_mut, read, write};
+use super::structs::{Sized0, destroy, give, object, object_mut, read, read_all, write};
 
 /// A renderer: compiled kernels, and memory that grows with the views. Use it from one thread at a time.
 #[derive(Debug)]
@@ -39,12 +38,17 @@ struct Shown {
 pub struct NspImageState {
     /// The image layout.
     pub layout: VkImageLayout,
-    /// The queue family that owns the image; `VK_QUEUE_FAMILY_IGNORED`: ownership is not transferred.
+    /// The queue family that owns the image; read if `is_owned`.
     pub family: u32,
     /// The pipeline stages in which the host uses the image.
     pub stages: VkPipelineStageFlags2,
     /// The host's accesses in these stages.
     pub access: VkAccessFlags2,
+    /// 1: `family` owns the image, and if it is not the lent family, the library's half of the ownership transfer is
+    /// recorded; 0: ownership is not transferred.
+    pub is_owned: u32,
+    /// Unused.
+    pub reserved: u32,
 }
 
 /// An array layer of an image: mip level 0, single-sampled. Its usage includes `TRANSFER_DST` if it is written, and
@@ -52,6 +56,8 @@ pub struct NspImageState {
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspImage {
+    /// `sizeof(NspImage)`.
+    pub struct_size: usize,
     /// The image.
     pub image: VkImage,
     /// Its format.
@@ -60,11 +66,18 @@ pub struct NspImage {
     pub extent: VkExtent2D,
     /// The array layer of the first camera.
     pub layer: u32,
+    /// The number of array layers; 0 stands for 1.
+    pub layers: u32,
     /// The state in which the host leaves the image.
     pub before: NspImageState,
-    /// The state after the render. If the queue families differ, the library's half of the ownership transfer is
-    /// recorded.
+    /// The state after the render.
     pub after: NspImageState,
+}
+
+// SAFETY: the size comes first; null handles are zeros.
+unsafe impl Sized0 for NspImage {
+    const NAME: &'static str = "NspImage";
+    const FIRST_SIZE: usize = size_of::<Self>();
 }
 
 /// Blends over the contents of `color` instead of replacing them.
@@ -263,12 +276,16 @@ unsafe fn record(
     if render.camera_count == 0 || render.cameras.is_null() {
         return Err(Failure::usage("NspRender::cameras is NULL or empty"));
     }
+    if render.reserved != 0 {
+        return Err(Failure::usage(format!("NspRender::reserved is {}, not 0", render.reserved)));
+    }
     // SAFETY: as the caller promises.
     let (cameras, color, depth, scene) = unsafe {
-        let cameras = std::slice::from_raw_parts(render.cameras, render.camera_count as usize);
-        let image = |image: *const NspImage, name| image.as_ref().map(|image| lent(image, name));
+        let image = |image: *const NspImage, name| {
+            (!image.is_null()).then(|| lent(&read(image)?, name, render.camera_count))
+        };
         (
-            cameras.iter().map(Camera::from).collect::<Vec<_>>(),
+            cameras(render)?,
             image(render.color, "NspRender::color").transpose()?,
             image(render.depth_out, "NspRender::depth_out").transpose()?,
             image(render.scene_depth, "NspRender::scene_depth").transpose()?,
@@ -307,7 +324,28 @@ unsafe fn record(
     Ok(())
 }
 
-fn lent(image: &NspImage, name: &str) -> Result<HostImage, Failure> {
+/// # Safety
+/// `render` says the truth.
+unsafe fn cameras(render: &NspRender) -> Result<Vec<Camera>, Failure> {
+    // SAFETY: as the caller promises.
+    let all = unsafe { read_all(render.cameras, render.camera_count) }?;
+    let camera = |(at, camera): (usize, &NspCamera)| {
+        camera.camera().map_err(|problem| Failure::usage(format!("camera {at} {problem}")))
+    };
+    all.iter().enumerate().map(camera).collect()
+}
+
+fn lent(image: &NspImage, name: &str, cameras: u32) -> Result<HostImage, Failure> {
+    let layers = image.layers.max(1);
+    if u64::from(image.layer) + u64::from(cameras) > u64::from(layers) {
+        let layer = image.layer;
+        return Err(Failure::usage(format!(
+            "{name} has {layers} layers (NspImage::layers), and {cameras} cameras from layer {layer} on need more"
+        )));
+    }
+    if [image.before, image.after].iter().any(|state| state.is_owned > 1 || state.reserved != 0) {
+        return Err(Failure::usage(format!("{name} has a state whose is_owned is not 0 or 1")));
+    }
     let format = ImageFormat::from_vulkan(image.format.as_raw()).ok_or_else(|| {
         Failure::usage(format!(
             "{name} has format {:?}; take RGBA16F, RGBA8 or BGRA8 (UNORM, SRGB) for color, R32F for depth_out, \
@@ -317,7 +355,7 @@ fn lent(image: &NspImage, name: &str) -> Result<HostImage, Failure> {
     })?;
     let state = |state: NspImageState| ImageState {
         layout: state.layout.as_raw(),
-        family: state.family,
+        family: if state.is_owned == 0 { vk::QUEUE_FAMILY_IGNORED } else { state.family },
         stages: state.stages.as_raw(),
         access: state.access.as_raw(),
     };

@@ -45,6 +45,21 @@ pub(super) unsafe fn read<T: Sized0 + Copy>(from: *const T) -> Result<T, Failure
     Ok(copy)
 }
 
+/// Reads a caller's array, whose elements are as long as the first says.
+///
+/// # Safety
+/// `from` points at `count` structs of that size.
+pub(super) unsafe fn read_all<T: Sized0 + Copy>(
+    from: *const T,
+    count: u32,
+) -> Result<Vec<T>, Failure> {
+    // SAFETY: as the caller promises.
+    let size = unsafe { size_of_struct(from)? };
+    let element = |at: usize| from.cast::<u8>().wrapping_add(at * size).cast::<T>();
+    // SAFETY: as the caller promises.
+    (0..count as usize).map(|at| unsafe { read(element(at)) }).collect()
+}
+
 /// # Safety
 /// As [`read`].
 unsafe fn size_of_struct<T: Sized0>(from: *const T) -> Result<usize, Failure> {
@@ -78,6 +93,31 @@ pub(super) unsafe fn write<T: Sized0 + Copy>(to: *mut T, from: &T) -> Result<(),
     unsafe {
         let bytes = std::ptr::from_ref(from).cast::<u8>().add(skipped);
         std::ptr::copy_nonoverlapping(bytes, to.cast::<u8>().add(skipped), taken);
+    }
+    Ok(())
+}
+
+/// Fills a caller's array, whose elements are as long as the first says; each gets that size.
+///
+/// # Safety
+/// As [`read_all`], and nothing else uses it.
+#[cfg(feature = "train")]
+pub(super) unsafe fn write_all<T: Sized0 + Copy>(
+    to: *mut T,
+    from: impl ExactSizeIterator<Item = T>,
+) -> Result<(), Failure> {
+    if from.len() == 0 {
+        return Ok(());
+    }
+    // SAFETY: as the caller promises.
+    let size = unsafe { size_of_struct(to) }?;
+    for (at, value) in from.enumerate() {
+        let element = to.cast::<u8>().wrapping_add(at * size).cast::<T>();
+        // SAFETY: as the caller promises.
+        unsafe {
+            element.cast::<usize>().write_unaligned(size);
+            write(element, &value)?;
+        }
     }
     Ok(())
 }

@@ -11,7 +11,7 @@ use std::ffi::c_char;
 use super::device::NspDevice;
 use super::error::{NspResult, guard};
 use super::model::NspModel;
-use super::structs::{destroy, give, object_mut};
+use super::structs::{Sized0, destroy, give, object_mut};
 use training::{Training, advance, begin, current, save};
 
 /// A training run. Use it from one thread at a time.
@@ -22,6 +22,8 @@ pub struct NspTrainer(Training);
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspStep {
+    /// `sizeof(NspStep)`; of the first of an array, the distance between its elements.
+    pub struct_size: usize,
     /// Counted from 1.
     pub step: u64,
     /// The weighted sum of its loss terms.
@@ -30,6 +32,12 @@ pub struct NspStep {
     pub gaussians: u32,
     /// Unused.
     pub reserved: u32,
+}
+
+// SAFETY: the size comes first; the rest are numbers.
+unsafe impl Sized0 for NspStep {
+    const NAME: &'static str = "NspStep";
+    const FIRST_SIZE: usize = size_of::<Self>();
 }
 
 /// Creates a trainer for the dataset in a folder. `config_toml` is text in the format of config.toml; NULL or empty:

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use nightsplat::ash::vk::Handle as _;
 use nightsplat::ash::{self, ext, khr, vk};
-use nightsplat::{HostDevice, required_device_features};
+use nightsplat::{FeatureStructs, HostDevice, require_features};
 use winit::raw_window_handle::{HasDisplayHandle as _, HasWindowHandle as _};
 use winit::window::Window;
 
@@ -22,7 +22,7 @@ pub(crate) struct Device {
     pub(crate) surface: vk::SurfaceKHR,
     pub(crate) physical: vk::PhysicalDevice,
     family: u32,
-    has_push_descriptors: bool,
+    extensions: Vec<&'static CStr>,
     pub(crate) raw: ash::Device,
     pub(crate) swapchains: khr::swapchain::Device,
     pub(crate) queue: vk::Queue,
@@ -52,18 +52,20 @@ impl Device {
             let queues = [vk::DeviceQueueCreateInfo::default()
                 .queue_family_index(family)
                 .queue_priorities(&[1.0])];
-            let mut extensions = vec![khr::swapchain::NAME.as_ptr()];
+            let mut extensions = vec![khr::swapchain::NAME];
             if has_push_descriptors {
-                extensions.push(khr::push_descriptor::NAME.as_ptr());
+                extensions.push(khr::push_descriptor::NAME);
             }
-            // The library's features first; then the host's own.
-            let (mut vulkan12, vulkan13) = required_device_features();
-            let mut vulkan13 = vulkan13.dynamic_rendering(true);
-            let info = vk::DeviceCreateInfo::default()
+            let names: Vec<_> = extensions.iter().map(|name| name.as_ptr()).collect();
+            // The host's features, and the library's.
+            let mut vulkan13 =
+                vk::PhysicalDeviceVulkan13Features::default().dynamic_rendering(true);
+            let mut info = vk::DeviceCreateInfo::default()
                 .queue_create_infos(&queues)
-                .enabled_extension_names(&extensions)
-                .push_next(&mut vulkan12)
+                .enabled_extension_names(&names)
                 .push_next(&mut vulkan13);
+            let mut structs = FeatureStructs::default();
+            require_features((&raw mut info).cast(), &mut structs, &[]);
             let raw = instance.create_device(physical, &info, None)?;
             let pool = vk::CommandPoolCreateInfo::default()
                 .queue_family_index(family)
@@ -83,14 +85,14 @@ impl Device {
                 surface,
                 physical,
                 family,
-                has_push_descriptors,
+                extensions,
                 raw,
             })
         }
     }
 
     /// As the library sees it. It records and never submits, so it is lent no queue.
-    pub(crate) fn lend(&self) -> HostDevice {
+    pub(crate) fn lend(&self) -> HostDevice<'_> {
         HostDevice {
             get_instance_proc_addr: self.entry.static_fn().get_instance_proc_addr as *const c_void,
             instance: self.instance.handle().as_raw(),
@@ -98,7 +100,7 @@ impl Device {
             device: self.raw.handle().as_raw(),
             queue_family: self.family,
             is_record_only: true,
-            has_push_descriptors: self.has_push_descriptors,
+            extensions: &self.extensions,
             names_objects: self.debug.is_some(),
             frames: self.frames.as_raw(),
             ..HostDevice::default()

@@ -3,8 +3,8 @@
 use glam::UVec2;
 use nightsplat_core::camera::Camera;
 
-use super::Renderer;
 use super::limits::max_tiles;
+use super::{Purpose, Renderer};
 use crate::{Error, Result};
 
 impl Renderer {
@@ -102,9 +102,13 @@ impl Renderer {
         let (UVec2 { x: width, y: height }, [tile_width, tile_height]) = (size, self.tile.size);
         let (count, most) = (self.tiles(size).element_product(), max_tiles(&self.gpu));
         let device = &self.gpu.properties().name;
+        let remedy = match self.settings.purpose {
+            Purpose::Show => "draw a smaller view",
+            Purpose::Train => "lower patch_pixels or take a larger tile",
+        };
         Error::Usage(format!(
             "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} allows {most}; \
-             lower patch_pixels or take a larger tile"
+             {remedy}"
         ))
     }
 }

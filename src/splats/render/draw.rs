@@ -93,6 +93,7 @@ impl Renderer {
         target: &Target<'_>,
     ) -> Result<()> {
         let gaussians = gaussians.into();
+        Target::check_background(options.background)?;
         self.prepare_draw(&gaussians.layout, cameras, target)?;
         self.clear_status(pass);
         for (layer, camera) in (0..).zip(cameras) {

@@ -123,6 +123,14 @@ impl Target<'_> {
         self.depth.is_some() || self.scene.is_some()
     }
 
+    /// Refuses a background that is not finite.
+    pub(super) fn check_background(background: [f32; 3]) -> Result<()> {
+        match background.iter().all(|channel| channel.is_finite()) {
+            true => Ok(()),
+            false => refused(format!("background is {background:?}; its channels are finite")),
+        }
+    }
+
     pub(super) fn check(&self, cameras: &[Camera], law: Option<&SceneLaw>) -> Result<()> {
         if cameras.is_empty() {
             return refused("no camera: pass at least one".to_owned());
@@ -147,6 +155,10 @@ impl Target<'_> {
         check_image("depth", self.depth, &[ImageFormat::R32Float], cameras)?;
         let Some(scene) = &self.scene else { return Ok(()) };
         check_image("scene depth", Some(scene.image), SCENE_FORMATS, cameras)?;
+        if [self.color, self.depth].iter().flatten().any(|image| image.handle == scene.image.handle)
+        {
+            return refused("the scene depth is one of the images that are written".to_owned());
+        }
         scene.check()
     }
 }
@@ -179,16 +191,26 @@ fn names<T: Debug>(all: &[T]) -> String {
     all.iter().map(|format| format!("{format:?}")).collect::<Vec<_>>().join(", ")
 }
 
+/// Focal lengths and principal points beyond are mistakes, and so are positions: products of them must be finite.
+const MOST_PIXELS: f64 = 1e9;
+const FARTHEST: f64 = 1e15;
+
 fn check_camera(index: usize, camera: &Camera) -> Result<()> {
     let Camera { width, height, focal, principal_point, view_from_world: pose, .. } = camera;
     if *width == 0 || *height == 0 {
         return refused(format!("camera {index} is {width}x{height}; it needs at least one pixel"));
     }
-    if !(focal.is_finite() && focal.min_element() > 0.0) {
-        return refused(format!("camera {index} has focal length {focal}; it is positive"));
+    if !(focal.min_element() > 0.0 && focal.max_element() <= MOST_PIXELS) {
+        return refused(format!(
+            "camera {index} has focal length {focal}; it is positive and at most {MOST_PIXELS:e}"
+        ));
     }
-    if !(principal_point.is_finite() && pose.is_finite()) {
-        return refused(format!("camera {index} has a number that is not finite"));
+    let is_near = principal_point.abs().max_element() <= MOST_PIXELS
+        && pose.translation.abs().max_element() <= FARTHEST;
+    if !(principal_point.is_finite() && pose.is_finite() && is_near) {
+        return refused(format!(
+            "camera {index} has a number that is not finite, or a place beyond {FARTHEST:e}"
+        ));
     }
     if let Some(off) = deviation_from_rigid(pose) {
         return refused(format!(

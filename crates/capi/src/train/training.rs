@@ -9,7 +9,7 @@ use super::{NspStep, NspTrainer};
 use crate::device::NspDevice;
 use crate::error::{Failure, Object};
 use crate::model::NspModel;
-use crate::structs::{object, text};
+use crate::structs::{object, text, write_all};
 
 /// The state of a trainer.
 pub(super) type Training = Object<TrainerOnDevice>;
@@ -56,11 +56,13 @@ pub(super) unsafe fn advance(
         let Some(count) = (unsafe { count.as_mut() }) else { return Ok(()) };
         let taken = if steps.is_null() { 0 } else { reports.len().min(*count as usize) };
         let last = &reports[reports.len() - taken..];
-        for (at, report) in last.iter().enumerate() {
-            let step = NspStep { step: report.step, loss: report.loss, gaussians, reserved: 0 };
-            // SAFETY: as the caller promises.
-            unsafe { steps.add(at).write(step) };
-        }
+        let struct_size = size_of::<NspStep>();
+        let all = last.iter().map(|report| {
+            let (step, loss) = (report.step, report.loss);
+            NspStep { struct_size, step, loss, gaussians, reserved: 0 }
+        });
+        // SAFETY: as the caller promises.
+        unsafe { write_all(steps, all) }?;
         *count = taken as u32;
         Ok(())
     })

@@ -211,22 +211,27 @@ fn every_member_is_where_c_has_it() {
     }
     let (rust, c) = layouts! {
         NspMemory { memory, offset, mapped, cookie }
-        NspMemoryFunctions { allocate, free, user }
+        NspMemoryFunctions { struct_size, allocate, free, user }
         NspHostDevice {
             struct_size, get_instance_proc_addr, instance, physical_device, device, queue, queue_family, flags,
             extensions, extension_count, features, lock_queue, unlock_queue, user, pipeline_cache, host_memory,
             device_memory, frames,
         }
-        NspCamera { width, height, focal, principal_point, view_from_world }
+        NspFeatureStructs {
+            struct_size, timeline_semaphore, scalar_block_layout, synchronization2, subgroup_size_control,
+        }
+        NspCamera {
+            struct_size, width, height, focal, principal_point, view_from_world, flags, reserved, distortion,
+        }
         NspModelInfo { struct_size, count, sh_degree, near_plane, max_alpha, raw_colors, law_stops, origin }
-        NspImageState { layout, family, stages, access }
-        NspImage { image, format, extent, layer, before, after }
+        NspImageState { layout, family, stages, access, is_owned, reserved }
+        NspImage { struct_size, image, format, extent, layer, layers, before, after }
         NspRender {
             struct_size, commands, frame, cameras, camera_count, flags, color, depth_out, scene_depth, scene_near,
             scene_far, exposure, background, budget, reserved,
         }
         NspStatus { struct_size, frame, intersections, capacity, left_out, splats_per_tile, device_bytes }
-        NspStep { step, loss, gaussians, reserved }
+        NspStep { struct_size, step, loss, gaussians, reserved }
     };
     let folder = tempfile::tempdir().unwrap();
     let source = folder.path().join("offsets.c");

@@ -33,7 +33,6 @@ use nightsplat_capi::error::*;
 use nightsplat_capi::model::*;
 use nightsplat_capi::render::*;
 use nightsplat_capi::train::*;
-use nightsplat_core::camera::Camera;
 use nightsplat_core::random::Stream;
 use nightsplat_photographs::image::linear_from_srgb;
 use nightsplat_photographs::tone::{
@@ -98,11 +97,15 @@ fn gaussians(sh_degree: u32) -> Gaussians {
 /// The camera of `examples/c/embed.c`.
 fn c_camera() -> NspCamera {
     NspCamera {
+        struct_size: size_of::<NspCamera>(),
         width: SIZE[0],
         height: SIZE[1],
         focal: [300.0; 2],
         principal_point: [160.0, 120.0],
         view_from_world: [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4.0],
+        flags: 0,
+        reserved: 0,
+        distortion: [0.0; 4],
     }
 }
 
@@ -118,7 +121,7 @@ fn own_planes(model: &Model) -> Vec<f32> {
     let gpu = gpu();
     let on_device = model.gaussians.upload(&gpu).unwrap();
     let mut renderer = Renderer::new(&gpu, model.render_settings()).unwrap();
-    let camera = Camera::from(&c_camera());
+    let camera = c_camera().camera().unwrap();
     renderer.reserve(on_device.layout.count, [&camera]).unwrap();
     let sh_degree = model.gaussians.shape.sh_degree;
     let options = RenderOptions { sh_degree, background: [0.0; 3] };
@@ -162,15 +165,19 @@ fn lend(host: &Host, flags: u32) -> NspHostDevice {
 fn image(picture: &Picture) -> NspImage {
     let state = |given: ImageState| NspImageState {
         layout: vk::ImageLayout::from_raw(given.layout),
-        family: vk::QUEUE_FAMILY_IGNORED,
+        family: 0,
         stages: vk::PipelineStageFlags2::from_raw(given.stages),
         access: vk::AccessFlags2::from_raw(given.access),
+        is_owned: 0,
+        reserved: 0,
     };
     NspImage {
+        struct_size: size_of::<NspImage>(),
         image: picture.image,
         format: vk::Format::R8G8B8A8_UNORM,
         extent: vk::Extent2D { width: picture.size[0], height: picture.size[1] },
         layer: 0,
+        layers: 0,
         before: state(ImageState::UNDEFINED),
         after: state(ImageState::TRANSFER_SOURCE),
     }
@@ -477,6 +484,7 @@ fn an_engines_matrices_give_the_camera_whatever_its_axes() {
     for (view, projection) in cases {
         // SAFETY: a valid struct of numbers.
         let mut camera: NspCamera = unsafe { std::mem::zeroed() };
+        camera.struct_size = size_of::<NspCamera>();
         // SAFETY: sixteen floats each.
         ok(unsafe {
             nsp_camera_from_matrices(
@@ -487,7 +495,7 @@ fn an_engines_matrices_give_the_camera_whatever_its_axes() {
                 &mut camera,
             )
         });
-        let converted = Camera::from(&camera);
+        let converted = camera.camera().unwrap();
         let focal = f64::from(height) / 2.0 / f64::from(vertical / 2.0).tan();
         assert!((converted.focal - focal).abs().max_element() < 1e-2, "{converted:?}");
         assert!((converted.principal_point - glam::DVec2::new(320.0, 240.0)).length() < 1e-3);
@@ -496,6 +504,7 @@ fn an_engines_matrices_give_the_camera_whatever_its_axes() {
     let refuse = |view: &Mat4, projection: &Mat4, word: &str| {
         // SAFETY: as above.
         let mut camera: NspCamera = unsafe { std::mem::zeroed() };
+        camera.struct_size = size_of::<NspCamera>();
         // SAFETY: as above.
         let result = unsafe {
             let (view, projection) = (view.as_ref().as_ptr(), projection.as_ref().as_ptr());
@@ -511,6 +520,9 @@ fn an_engines_matrices_give_the_camera_whatever_its_axes() {
     let mut broken = left_handed;
     broken.x_axis.x = f32::NAN;
     refuse(&Mat4::IDENTITY, &broken, "finite");
+    // A projection with y up for a viewport of negative height, and a view that scales.
+    refuse(&Mat4::IDENTITY, &right_handed, "projection[5]");
+    refuse(&Mat4::from_scale(Vec3::splat(2.0)), &left_handed, "divide its scale out");
 }
 
 /// glam has no conversion of this kind.

@@ -32,14 +32,16 @@ fn every_bad_device_is_refused_by_code_and_name() {
     refuse(&|lent| lent.flags &= !NSP_DEVICE_RECORD_ONLY, NSP_ERROR_USAGE, &["::queue"]);
     refuse(&|lent| lent.lock_queue = Some(lock_queue), NSP_ERROR_USAGE, &["lock_queue", "both"]);
     refuse(&|lent| lent.extension_count = 1, NSP_ERROR_USAGE, &["::extensions"]);
-    let functions = NspMemoryFunctions { allocate: None, free: None, user: null_mut() };
+    let struct_size = size_of::<NspMemoryFunctions>();
+    let functions =
+        NspMemoryFunctions { struct_size, allocate: None, free: None, user: null_mut() };
     refuse(&|lent| lent.device_memory = &functions, NSP_ERROR_USAGE, &["device_memory"]);
     refuse(&|lent| lent.queue_family = 7, NSP_ERROR_USAGE, &["queue_family", "7"]);
     // A chain of features without one that is needed.
     let mut vulkan13 = vk::PhysicalDeviceVulkan13Features::default().synchronization2(true);
-    let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default();
-    // SAFETY: valid structs.
-    unsafe { nsp_require_features(&mut vulkan12, null_mut()) };
+    let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default()
+        .timeline_semaphore(true)
+        .scalar_block_layout(true);
     let chain =
         vk::PhysicalDeviceFeatures2::default().push_next(&mut vulkan12).push_next(&mut vulkan13);
     let features = (&raw const chain).cast();
@@ -331,8 +333,12 @@ fn the_hosts_allocator_gives_all_memory_and_gets_it_back() {
         return not_run("lavapipe", "the host's allocator needs memory types that are all mapped");
     }
     let host_memory = OnceLock::new();
-    let mut functions =
-        NspMemoryFunctions { allocate: Some(allocate), free: Some(free), user: null_mut() };
+    let mut functions = NspMemoryFunctions {
+        struct_size: size_of::<NspMemoryFunctions>(),
+        allocate: Some(allocate),
+        free: Some(free),
+        user: null_mut(),
+    };
     let mut session = Session::new(|lent| {
         // SAFETY: the handles are live.
         let device = unsafe {

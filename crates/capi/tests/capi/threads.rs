@@ -52,8 +52,16 @@ fn a_trainer_and_its_host_submit_from_two_threads_under_the_hosts_lock() {
         // SAFETY: everything is valid, on this thread alone but for the device.
         unsafe {
             ok(nsp_trainer_create(device, dataset.as_ptr(), config.as_ptr(), &mut trainer));
-            let (mut last, mut steps) =
-                (0, [NspStep { step: 0, loss: 0.0, gaussians: 0, reserved: 0 }; 64]);
+            let (mut last, mut steps) = (
+                0,
+                [NspStep {
+                    struct_size: size_of::<NspStep>(),
+                    step: 0,
+                    loss: 0.0,
+                    gaussians: 0,
+                    reserved: 0,
+                }; 64],
+            );
             while last < 40 {
                 let mut count = 64;
                 ok(nsp_trainer_advance(trainer, 40, steps.as_mut_ptr(), &mut count));
