@@ -33,12 +33,14 @@ case $version in
 esac
 
 mkdir -p "$out/include" "$out/lib/pkgconfig" "$out/lib/cmake/nightsplat"
-cargo rustc "${options[@]}" --crate-type cdylib -- -C "link-arg=-Wl,-soname,libnightsplat.so.$abi"
+# Both kinds of library are made of one compilation.
+kinds=cdylib
+[ "$profile" != release ] || kinds=cdylib,staticlib
+cargo rustc "${options[@]}" --crate-type "$kinds" -- -C "link-arg=-Wl,-soname,libnightsplat.so.$abi"
 install -m 755 "$built/libnightsplat_capi.so" "$out/lib/libnightsplat.so.$abi"
-[ "$profile" != release ] || strip --strip-unneeded "$out/lib/libnightsplat.so.$abi"
 ln -sf "libnightsplat.so.$abi" "$out/lib/libnightsplat.so"
 if [ "$profile" = release ]; then
-    cargo rustc "${options[@]}" --crate-type staticlib
+    strip --strip-unneeded "$out/lib/libnightsplat.so.$abi"
     install -m 644 "$built/libnightsplat_capi.a" "$out/lib/libnightsplat.a"
 fi
 install -m 644 crates/capi/src/nightsplat.h "$out/include/nightsplat.h"

@@ -29,26 +29,30 @@ pub(super) fn supported(
     physical: vk::PhysicalDevice,
     supported: &Supported,
 ) -> Option<CooperativeMatrix> {
-    let name = EXTENSION.to_string_lossy();
-    let vulkan12 = &supported.vulkan12;
-    let has_all = supported.extensions.contains(name.as_ref())
-        && vulkan12.shader_float16 == vk::TRUE
-        && vulkan12.vulkan_memory_model == vk::TRUE
-        && vulkan12.vulkan_memory_model_device_scope == vk::TRUE;
-    if !has_all {
+    if !supported.has(EXTENSION) {
         return None;
     }
     let functions = khr::cooperative_matrix::Instance::new(entry, instance);
     let mut feature = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default();
     let mut halves = vk::PhysicalDevice16BitStorageFeatures::default();
-    let mut features =
-        vk::PhysicalDeviceFeatures2::default().push_next(&mut feature).push_next(&mut halves);
+    let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default();
+    let mut features = vk::PhysicalDeviceFeatures2::default()
+        .push_next(&mut feature)
+        .push_next(&mut halves)
+        .push_next(&mut vulkan12);
     // SAFETY: the chain points at a live local; the extension is there.
     let shapes = unsafe {
         instance.get_physical_device_features2(physical, &mut features);
         functions.get_physical_device_cooperative_matrix_properties(physical)
     };
-    if [feature.cooperative_matrix, halves.storage_buffer16_bit_access].contains(&vk::FALSE) {
+    let needed = [
+        feature.cooperative_matrix,
+        halves.storage_buffer16_bit_access,
+        vulkan12.shader_float16,
+        vulkan12.vulkan_memory_model,
+        vulkan12.vulkan_memory_model_device_scope,
+    ];
+    if needed.contains(&vk::FALSE) {
         return None;
     }
     let (half, single) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);

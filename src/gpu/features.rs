@@ -88,10 +88,35 @@ const FULL_SUBGROUPS: &str = "computeFullSubgroups";
 #[repr(C)]
 #[derive(Debug, Default)]
 pub struct FeatureStructs {
-    timeline_semaphore: vk::PhysicalDeviceTimelineSemaphoreFeatures<'static>,
-    scalar_block_layout: vk::PhysicalDeviceScalarBlockLayoutFeatures<'static>,
-    synchronization2: vk::PhysicalDeviceSynchronization2Features<'static>,
-    subgroup_size_control: vk::PhysicalDeviceSubgroupSizeControlFeatures<'static>,
+    pub(super) timeline_semaphore: vk::PhysicalDeviceTimelineSemaphoreFeatures<'static>,
+    pub(super) scalar_block_layout: vk::PhysicalDeviceScalarBlockLayoutFeatures<'static>,
+    pub(super) synchronization2: vk::PhysicalDeviceSynchronization2Features<'static>,
+    pub(super) subgroup_size_control: vk::PhysicalDeviceSubgroupSizeControlFeatures<'static>,
+}
+
+impl FeatureStructs {
+    /// Those that a physical device supports.
+    pub(super) fn supported(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Self {
+        let mut structs = Self::default();
+        let mut features = vk::PhysicalDeviceFeatures2::default();
+        // SAFETY: the chain is of live locals, and each bit is overwritten.
+        unsafe {
+            require_features((&raw mut features).cast(), &mut structs, &[]);
+            instance.get_physical_device_features2(physical, &mut features);
+        }
+        let Self {
+            timeline_semaphore,
+            scalar_block_layout,
+            synchronization2,
+            subgroup_size_control,
+        } = &mut structs;
+        // They move.
+        timeline_semaphore.p_next = std::ptr::null_mut();
+        scalar_block_layout.p_next = std::ptr::null_mut();
+        synchronization2.p_next = std::ptr::null_mut();
+        subgroup_size_control.p_next = std::ptr::null_mut();
+        structs
+    }
 }
 
 /// Enables the features that the library needs, in the chain with which a host creates the device that it lends to

@@ -57,27 +57,27 @@ pub const REQUIREMENTS: &[Requirement] = &[
     Requirement {
         name: "timelineSemaphore",
         why: "one counter orders all submissions",
-        supported: |o| o.vulkan12.timeline_semaphore == vk::TRUE,
+        supported: |o| o.features.timeline_semaphore.timeline_semaphore == vk::TRUE,
     },
     Requirement {
         name: "scalarBlockLayout",
         why: "the same bytes in GLSL and Rust",
-        supported: |o| o.vulkan12.scalar_block_layout == vk::TRUE,
+        supported: |o| o.features.scalar_block_layout.scalar_block_layout == vk::TRUE,
     },
     Requirement {
         name: "synchronization2",
         why: "barriers and submissions",
-        supported: |o| o.vulkan13.synchronization2 == vk::TRUE,
+        supported: |o| o.features.synchronization2.synchronization2 == vk::TRUE,
     },
     Requirement {
         name: "subgroupSizeControl",
         why: "one subgroup owns a tile: its size must be known",
-        supported: |o| o.vulkan13.subgroup_size_control == vk::TRUE,
+        supported: |o| o.features.subgroup_size_control.subgroup_size_control == vk::TRUE,
     },
     Requirement {
         name: "computeFullSubgroups",
         why: "every lane of a subgroup takes part",
-        supported: |o| o.vulkan13.compute_full_subgroups == vk::TRUE,
+        supported: |o| o.features.subgroup_size_control.compute_full_subgroups == vk::TRUE,
     },
     Requirement {
         name: "subgroup operations basic, vote, arithmetic, ballot, shuffle in compute",
@@ -125,7 +125,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     use super::*;
-    use crate::gpu::device::own_features;
+    use crate::gpu::features::{FeatureStructs, require_features};
     use crate::gpu::subgroups::SubgroupSizes;
 
     /// A device that meets every requirement and no more.
@@ -138,7 +138,10 @@ mod tests {
         for (to, from) in properties.device_name.iter_mut().zip(b"Abacus 3000") {
             *to = *from as _;
         }
-        let (vulkan12, vulkan13) = own_features();
+        let (mut features, mut chain) =
+            (FeatureStructs::default(), vk::PhysicalDeviceFeatures2::default());
+        // SAFETY: a valid chain.
+        unsafe { require_features((&raw mut chain).cast(), &mut features, &[]) };
         Supported {
             properties,
             subgroups: SubgroupSizes {
@@ -156,8 +159,7 @@ mod tests {
             max_buffer: 1 << 30,
             max_push_descriptors: 0,
             extensions: BTreeSet::new(),
-            vulkan12,
-            vulkan13,
+            features,
             compute_family: Some(0),
             timestamp_bits: 64,
         }
@@ -172,11 +174,17 @@ mod tests {
             ("maxPerStageDescriptorStorageBuffers >= 12", |o| {
                 o.properties.limits.max_per_stage_descriptor_storage_buffers = 11;
             }),
-            ("timelineSemaphore", |o| o.vulkan12.timeline_semaphore = vk::FALSE),
-            ("scalarBlockLayout", |o| o.vulkan12.scalar_block_layout = vk::FALSE),
-            ("synchronization2", |o| o.vulkan13.synchronization2 = vk::FALSE),
-            ("subgroupSizeControl", |o| o.vulkan13.subgroup_size_control = vk::FALSE),
-            ("computeFullSubgroups", |o| o.vulkan13.compute_full_subgroups = vk::FALSE),
+            ("timelineSemaphore", |o| o.features.timeline_semaphore.timeline_semaphore = vk::FALSE),
+            ("scalarBlockLayout", |o| {
+                o.features.scalar_block_layout.scalar_block_layout = vk::FALSE
+            }),
+            ("synchronization2", |o| o.features.synchronization2.synchronization2 = vk::FALSE),
+            ("subgroupSizeControl", |o| {
+                o.features.subgroup_size_control.subgroup_size_control = vk::FALSE
+            }),
+            ("computeFullSubgroups", |o| {
+                o.features.subgroup_size_control.compute_full_subgroups = vk::FALSE
+            }),
             ("subgroup operations", |o| o.subgroup_operations = vk::SubgroupFeatureFlags::BASIC),
             ("subgroup size", |o| o.subgroups.default = 2),
             ("maxComputeWorkGroupInvocations", |o| {

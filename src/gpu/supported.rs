@@ -5,6 +5,7 @@ use std::ffi::CStr;
 
 use ash::{ext, khr, vk};
 
+use super::features::FeatureStructs;
 use super::limits::MAX_BUFFERS;
 use super::pci::PciAddress;
 use super::subgroups::{SUBGROUP_VARIABLE, SubgroupSizes, lanes};
@@ -29,8 +30,7 @@ pub(super) struct Supported {
     pub(super) subgroup_stages: vk::ShaderStageFlags,
     pub(super) max_push_descriptors: u32,
     pub(super) extensions: BTreeSet<String>,
-    pub(super) vulkan12: vk::PhysicalDeviceVulkan12Features<'static>,
-    pub(super) vulkan13: vk::PhysicalDeviceVulkan13Features<'static>,
+    pub(super) features: FeatureStructs,
     pub(super) compute_family: Option<u32>,
     /// Of that family.
     pub(super) timestamp_bits: u32,
@@ -48,13 +48,20 @@ impl Supported {
                 .filter_map(|e| Some(e.extension_name_as_c_str().ok()?.to_string_lossy().into()))
                 .collect();
         let has = |name: &CStr| extensions.contains(name.to_string_lossy().as_ref());
-        let mut vulkan11 = vk::PhysicalDeviceVulkan11Properties::default();
-        let mut vulkan13_properties = vk::PhysicalDeviceVulkan13Properties::default();
+        // The structs of extensions, which instances of Vulkan 1.1 take too.
+        let mut id = vk::PhysicalDeviceIDProperties::default();
+        let mut subgroups = vk::PhysicalDeviceSubgroupProperties::default();
+        let mut sizes = vk::PhysicalDeviceSubgroupSizeControlProperties::default();
+        let mut allocation = vk::PhysicalDeviceMaintenance3Properties::default();
+        let mut buffers = vk::PhysicalDeviceMaintenance4Properties::default();
         let mut push = vk::PhysicalDevicePushDescriptorPropertiesKHR::default();
         let mut pci = vk::PhysicalDevicePCIBusInfoPropertiesEXT::default();
         let mut properties = vk::PhysicalDeviceProperties2::default()
-            .push_next(&mut vulkan11)
-            .push_next(&mut vulkan13_properties);
+            .push_next(&mut id)
+            .push_next(&mut subgroups)
+            .push_next(&mut sizes)
+            .push_next(&mut allocation)
+            .push_next(&mut buffers);
         // Some drivers reject structures that they do not know.
         if has(khr::push_descriptor::NAME) {
             properties = properties.push_next(&mut push);
@@ -63,15 +70,9 @@ impl Supported {
         if has_pci {
             properties = properties.push_next(&mut pci);
         }
-        let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default();
-        let mut vulkan13 = vk::PhysicalDeviceVulkan13Features::default();
-        let mut features = vk::PhysicalDeviceFeatures2::default()
-            .push_next(&mut vulkan12)
-            .push_next(&mut vulkan13);
-        // SAFETY: the chains point at live locals of the types that the structures name.
+        // SAFETY: the chain points at live locals of the types that the structures name.
         let families = unsafe {
             instance.get_physical_device_properties2(physical, &mut properties);
-            instance.get_physical_device_features2(physical, &mut features);
             instance.get_physical_device_queue_family_properties(physical)
         };
         let properties = properties.properties;
@@ -79,37 +80,29 @@ impl Supported {
             families.iter().position(|family| family.queue_flags.contains(vk::QueueFlags::COMPUTE));
         Ok(Self {
             properties,
-            uuid: vulkan11.device_uuid,
+            uuid: id.device_uuid,
             pci: has_pci.then_some(PciAddress {
                 domain: pci.pci_domain,
                 bus: pci.pci_bus,
                 device: pci.pci_device,
                 function: pci.pci_function,
             }),
-            max_allocation: vulkan11.max_memory_allocation_size,
-            max_buffer: vulkan13_properties.max_buffer_size,
+            max_allocation: allocation.max_memory_allocation_size,
+            max_buffer: buffers.max_buffer_size,
             subgroups: SubgroupSizes {
-                default: vulkan11.subgroup_size,
-                are_selectable: vulkan13_properties
+                default: subgroups.subgroup_size,
+                are_selectable: sizes
                     .required_subgroup_size_stages
                     .contains(vk::ShaderStageFlags::COMPUTE),
-                least: vulkan13_properties.min_subgroup_size,
-                most: vulkan13_properties.max_subgroup_size,
-                workgroup_limit: vulkan13_properties.max_compute_workgroup_subgroups,
+                least: sizes.min_subgroup_size,
+                most: sizes.max_subgroup_size,
+                workgroup_limit: sizes.max_compute_workgroup_subgroups,
             },
-            subgroup_operations: vulkan11.subgroup_supported_operations,
-            subgroup_stages: vulkan11.subgroup_supported_stages,
+            subgroup_operations: subgroups.supported_operations,
+            subgroup_stages: subgroups.supported_stages,
             max_push_descriptors: push.max_push_descriptors,
             extensions,
-            // The chain pointers die with this function.
-            vulkan12: vk::PhysicalDeviceVulkan12Features {
-                p_next: std::ptr::null_mut(),
-                ..vulkan12
-            },
-            vulkan13: vk::PhysicalDeviceVulkan13Features {
-                p_next: std::ptr::null_mut(),
-                ..vulkan13
-            },
+            features: FeatureStructs::supported(instance, physical),
             compute_family: compute.and_then(|index| u32::try_from(index).ok()),
             timestamp_bits: compute.map_or(0, |index| families[index].timestamp_valid_bits),
         })

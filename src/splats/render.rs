@@ -429,7 +429,7 @@ impl Renderer {
     /// Columns and rows of tiles.
     fn tiles(&self, size: UVec2) -> UVec2 {
         let tile = UVec2::from(self.tile.size);
-        (size + tile - 1) / tile
+        size.saturating_add(tile - 1) / tile
     }
 
     fn view<'a>(&mut self, viewpoint: &Viewpoint<'a>, view_depths: bool) -> Result<KernelView<'a>> {

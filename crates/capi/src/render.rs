@@ -280,15 +280,15 @@ unsafe fn record(
         return Err(Failure::usage(format!("NspRender::reserved is {}, not 0", render.reserved)));
     }
     // SAFETY: as the caller promises.
-    let (cameras, color, depth, scene) = unsafe {
+    let (color, depth, scene, cameras) = unsafe {
         let image = |image: *const NspImage, name| {
             (!image.is_null()).then(|| lent(&read(image)?, name, render.camera_count))
         };
         (
-            cameras(render)?,
             image(render.color, "NspRender::color").transpose()?,
             image(render.depth_out, "NspRender::depth_out").transpose()?,
             image(render.scene_depth, "NspRender::scene_depth").transpose()?,
+            cameras(render)?,
         )
     };
     let has = |flag: u32| render.flags & flag != 0;

@@ -100,7 +100,8 @@ impl Renderer {
 
     fn too_many_tiles(&self, size: UVec2) -> Error {
         let (UVec2 { x: width, y: height }, [tile_width, tile_height]) = (size, self.tile.size);
-        let (count, most) = (self.tiles(size).element_product(), max_tiles(&self.gpu));
+        let tiles = self.tiles(size).as_u64vec2();
+        let (count, most) = (tiles.element_product(), max_tiles(&self.gpu));
         let device = &self.gpu.properties().name;
         let remedy = match self.settings.purpose {
             Purpose::Show => "draw a smaller view",

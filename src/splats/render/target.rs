@@ -200,7 +200,7 @@ fn check_camera(index: usize, camera: &Camera) -> Result<()> {
     if *width == 0 || *height == 0 {
         return refused(format!("camera {index} is {width}x{height}; it needs at least one pixel"));
     }
-    if !(focal.min_element() > 0.0 && focal.max_element() <= MOST_PIXELS) {
+    if !(focal.is_finite() && focal.min_element() > 0.0 && focal.max_element() <= MOST_PIXELS) {
         return refused(format!(
             "camera {index} has focal length {focal}; it is positive and at most {MOST_PIXELS:e}"
         ));

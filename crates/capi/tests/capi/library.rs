@@ -47,11 +47,15 @@ fn compile(compiler: &str, standard: &str, source: &Path, more: &[&str]) -> Path
 
 /// Compiles an example that links with the library.
 fn example(name: &str, more: &[&str]) -> PathBuf {
+    linked(&Path::new(ROOT).join("examples/c").join(name), more)
+}
+
+/// Compiles a program that links with the library.
+fn linked(source: &Path, more: &[&str]) -> PathBuf {
     let lib = library().join("lib").display().to_string();
     let [path, rpath] = [format!("-L{lib}"), format!("-Wl,-rpath,{lib}")];
     let linked = [&path, "-lnightsplat", "-lvulkan", "-lm", &rpath];
-    let source = Path::new(ROOT).join("examples/c").join(name);
-    compile("cc", "-std=c99", &source, &[&linked, more].concat())
+    compile("cc", "-std=c99", source, &[&linked, more].concat())
 }
 
 /// An example, and other sources, with our memory and the host's checked by the sanitizers of the compiler. Libraries
@@ -126,6 +130,23 @@ fn the_c_host_draws_our_own_render_without_a_message() {
         [&failed.stdout, &failed.stderr].map(|text| String::from_utf8_lossy(text));
     assert!(!failed.status.success() && !stdout.contains("Validation"), "{stdout}");
     assert!(error.contains("nsp_model_load: absent.ply") && error.contains("(-3)"), "{error}");
+}
+
+#[test]
+fn no_wrong_call_ends_the_process() {
+    if !has_vulkan_headers() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    Model::from(gaussians(2)).save(folder.path().join("model.ply")).unwrap();
+    for more in [&[][..], &["-g", "-fsanitize=address,undefined"]] {
+        let program =
+            linked(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/c/wrong_calls.c"), more);
+        // Each case leaves what it made, and the layer's state of a forked process is not its own.
+        let done = run(&program, folder.path(), &["model.ply"], "");
+        let lines = printed(&done);
+        assert!(lines.ends_with("0 of 11 cases are wrong\n"), "{lines}");
+    }
 }
 
 #[test]
