@@ -189,8 +189,8 @@ pub use splats::lamp::Lamp;
 pub use splats::model::Model;
 pub use splats::packed_sh::StorageFormat;
 pub use splats::render::{
-    Damping, DepthConvention, DepthKind, Drawn, Gradients, Purpose, RenderOptions, RenderSettings,
-    Renderer, SceneDepth, Status, Target, Viewpoint,
+    Damping, DepthConvention, DepthKind, Drawn, Gradients, Instance, Purpose, RenderOptions,
+    RenderSettings, Renderer, SceneDepth, Status, Target, Viewpoint,
 };
 pub use splats::scene::{DeviceGaussians, Features, GaussianSlice, Gaussians, Layout, Shape};
 

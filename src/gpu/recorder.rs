@@ -49,6 +49,8 @@ pub struct Recorder<'g> {
     pending: HashMap<vk::Buffer, bool>,
     /// The stages outside this recording that read our buffers, before it or after it.
     readers: vk::PipelineStageFlags2,
+    /// The passes being recorded write different parts of the same buffers.
+    is_concurrent: bool,
     /// Runs each pass alone and compares it with its reference instead of recording it.
     pub(super) observer: Option<&'g mut (dyn PassObserver + 'g)>,
 }
@@ -149,6 +151,7 @@ impl<'g> Recorder<'g> {
             labels: vec![],
             pending: HashMap::new(),
             readers,
+            is_concurrent: false,
             observer: None,
         }
     }
@@ -240,6 +243,19 @@ impl<'g> Recorder<'g> {
         Ok(())
     }
 
+    /// Records passes that write different parts of the same buffers, with no barrier between them. A check, which copies
+    /// between passes, has its barriers.
+    pub(crate) fn concurrently<R>(
+        &mut self,
+        record: impl FnOnce(&mut Self) -> Result<R>,
+    ) -> Result<R> {
+        self.barrier();
+        self.is_concurrent = self.observer.is_none();
+        let done = record(self);
+        self.is_concurrent = false;
+        done
+    }
+
     /// Sets every 32-bit word of `buffer` to `word`.
     #[doc(hidden)]
     pub fn fill<T: bytemuck::Pod>(&mut self, buffer: &mut Buffer<T>, word: u32) {
@@ -254,8 +270,8 @@ impl<'g> Recorder<'g> {
         }
     }
 
-    /// Overwrites the first elements of `buffer` with `data`, which is stored in the command buffer: for a few numbers
-    /// that the host knows when it records.
+    /// Overwrites the first elements of `buffer` with `data`, which is stored in the command buffer: for numbers that the
+    /// host knows when it records.
     pub(crate) fn update<T: bytemuck::Pod>(
         &mut self,
         buffer: &mut Buffer<T>,
@@ -263,14 +279,16 @@ impl<'g> Recorder<'g> {
     ) -> Result<()> {
         let bytes: &[u8] = bytemuck::cast_slice(data);
         let Bound { raw, offset, size } = buffer.bound();
-        if bytes.len() as u64 > size || bytes.len() > MAX_UPDATE {
+        if bytes.len() as u64 > size {
             let (name, count) = (buffer.name(), data.len());
             return Err(Error::Usage(format!("{count} elements do not fit buffer `{name}`")));
         }
         if !bytes.is_empty() {
             self.synchronize([(raw, true)].into_iter());
+        }
+        for (at, part) in (offset..).step_by(MAX_UPDATE).zip(bytes.chunks(MAX_UPDATE)) {
             // SAFETY: recording; the buffer holds the bytes. Sizes of our element types are multiples of four.
-            unsafe { self.shared.device.cmd_update_buffer(self.commands, raw, offset, bytes) };
+            unsafe { self.shared.device.cmd_update_buffer(self.commands, raw, at, part) };
         }
         Ok(())
     }
@@ -315,9 +333,10 @@ impl<'g> Recorder<'g> {
     /// Records one full barrier if a buffer in `uses` was written since the last barrier, or is written now and was
     /// read.
     pub(super) fn synchronize(&mut self, uses: impl Iterator<Item = (vk::Buffer, bool)> + Clone) {
-        let hazard = uses
-            .clone()
-            .any(|(raw, writes)| self.pending.get(&raw).is_some_and(|&written| written || writes));
+        let hazard = !self.is_concurrent
+            && uses.clone().any(|(raw, writes)| {
+                self.pending.get(&raw).is_some_and(|&written| written || writes)
+            });
         if hazard {
             self.barrier();
         }

@@ -92,6 +92,11 @@ impl<'a, T: bytemuck::Pod> Slice<'a, T> {
         }
     }
 
+    /// Whether both begin at the same element of the same buffer.
+    pub(crate) fn begins_with(&self, other: &Self) -> bool {
+        std::ptr::eq(self.memory, other.memory) && self.first == other.first
+    }
+
     /// The name of the buffer.
     pub(crate) fn name(&self) -> &str {
         self.memory.name()

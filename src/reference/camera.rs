@@ -14,7 +14,7 @@ use pinhole::Pinhole;
 /// A camera as in the buffer of cameras.
 #[derive(Clone, Debug)]
 pub struct ReferenceCamera {
-    /// The rotation from world to view.
+    /// The rotation from world to view; for an instance, that from its model with its scale.
     pub rotation: DMat3,
     /// The translation from world to view.
     pub translation: DVec3,
@@ -79,7 +79,7 @@ impl ReferenceCamera {
 
     /// The camera's position in the world.
     pub fn center(&self) -> DVec3 {
-        -(self.rotation.transpose() * self.translation)
+        -(self.rotation.inverse() * self.translation)
     }
 
     /// The depth of a point in view coordinates; not positive if the model does not see it.

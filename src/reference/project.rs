@@ -1,6 +1,6 @@
 //! One Gaussian from world space to the image plane, in f64.
 
-use glam::{DMat3, DVec2, DVec3, DVec4, UVec2};
+use glam::{DMat3, DVec2, DVec3, DVec4, UVec2, Vec4};
 
 use super::camera::ReferenceCamera;
 use super::gaussian::{Gaussian, Planes, sigmoid};
@@ -9,11 +9,11 @@ use super::rotation::{rotation, unit_quat};
 use super::rounding::{UNIT, sensitivity};
 use super::sh::sh_basis;
 use super::splat::{Splat, extent_error, splat_level, splat_tile_rows, splat_tiles, stored_color};
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::{Kernel as _, Reference, Tolerance};
 use crate::kernels::camera::NEAREST;
 use crate::kernels::project::{CULLED, Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::{ALPHA_MIN, DILATION};
-use crate::kernels::{self, ProjectedSplat};
+use crate::kernels::{self, InstanceView, ProjectedSplat};
 
 /// The projection of one Gaussian onto the image plane.
 #[derive(Clone, Debug)]
@@ -123,6 +123,12 @@ fn depth_key(depth: f32, near: f32) -> u32 {
     (beyond >> 4).min(CULLED - 1)
 }
 
+/// The keys of positive numbers differ by sixteenths of their difference in units in the last place.
+fn key_error(depth: f32, error: f64) -> f64 {
+    let last_place = f64::from(depth.next_up()) - f64::from(depth);
+    1.0 + (1.0 + error / last_place) / 16.0
+}
+
 /// The tiles of an image that a splat covers.
 fn tile_count(size: UVec2, constants: &Constants, splat: &ProjectedSplat) -> u32 {
     let tile = UVec2::new(constants.tile_width, constants.tile_height);
@@ -134,6 +140,19 @@ fn tile_count(size: UVec2, constants: &Constants, splat: &ProjectedSplat) -> u32
     (top..bottom).map(row).sum()
 }
 
+/// The instances of a dispatch; without any, the model itself.
+fn instances<'a>(
+    params: &Params,
+    constants: &Constants,
+    table: &'a [InstanceView],
+) -> Vec<Option<&'a InstanceView>> {
+    if !constants.instances {
+        return vec![None];
+    }
+    let [first, count] = [params.first_instance, params.instance_count].map(|n| n as usize);
+    table[first..first + count].iter().map(Some).collect()
+}
+
 /// A view and its Gaussians.
 struct ProjectionInputs<'a> {
     params: &'a Params,
@@ -143,6 +162,11 @@ struct ProjectionInputs<'a> {
     camera: ReferenceCamera,
     lamp: Option<ReferenceLamp>,
     planes: Planes,
+    instance: Option<&'a InstanceView>,
+    /// The splat of the first Gaussian.
+    first: usize,
+    /// Factors of the colour and of the opacity.
+    tint: DVec4,
 }
 
 impl<'a> ProjectionInputs<'a> {
@@ -151,6 +175,7 @@ impl<'a> ProjectionInputs<'a> {
         constants: &'a Constants,
         cameras: &[kernels::Camera],
         lamp: &[f32],
+        instance: Option<&'a InstanceView>,
     ) -> Self {
         let Constants { channels, sh_degree, view_depths, .. } = *constants;
         let planes = Planes::new(
@@ -159,10 +184,24 @@ impl<'a> ProjectionInputs<'a> {
             sh_degree,
             constants.rest_by_column,
         );
-        let camera = &cameras[params.camera_index as usize];
-        let (size, camera) = (camera.size, ReferenceCamera::from(camera));
+        let mut camera = cameras[params.camera_index as usize];
+        if let Some(instance) = instance {
+            camera.view_from_world = instance.view_from_model;
+        }
+        let (size, camera) = (camera.size, ReferenceCamera::from(&camera));
         let lamp = constants.lamp.then(|| ReferenceLamp::from_numbers(lamp));
-        Self { params, constants, size, camera, lamp, planes }
+        let first =
+            instance.map_or(0, |instance| (instance.first + params.first_gaussian) as usize);
+        let tint = instance.map_or(DVec4::ONE, |instance| Vec4::from(instance.tint).as_dvec4());
+        Self { params, constants, size, camera, lamp, planes, instance, first, tint }
+    }
+
+    /// Whether an instance shows no Gaussian there.
+    fn is_clipped(&self, gaussian: &Gaussian) -> bool {
+        self.instance.is_some_and(|instance| {
+            let mean = gaussian.mean.as_vec3();
+            !(mean.cmpge(instance.box_min).all() && mean.cmple(instance.box_max).all())
+        })
     }
 
     fn project(&self, gaussian: &Gaussian) -> Option<Projection> {
@@ -170,7 +209,14 @@ impl<'a> ProjectionInputs<'a> {
         let Constants { raw_colors, antialiased, .. } = *self.constants;
         let (near, lamp) = (near.into(), self.lamp);
         let settings = ProjectionSettings { near, sh_degree, raw_colors, antialiased, lamp };
-        project_gaussian(&self.camera, settings, gaussian)
+        if self.instance.is_none() {
+            return project_gaussian(&self.camera, settings, gaussian);
+        }
+        let opacity = self.tint.w * sigmoid(gaussian.raw_opacity);
+        let raw_opacity = (opacity / (1.0 - opacity)).ln();
+        let tinted = Gaussian { raw_opacity, ..gaussian.clone() };
+        let projection = project_gaussian(&self.camera, settings, &tinted)?;
+        Some(Projection { color: self.tint.truncate() * projection.color, ..projection })
     }
 
     /// The error bound of each of [`Projection::numbers`]: the kernel computes them for a Gaussian that is off by a few
@@ -225,7 +271,8 @@ impl<'a> ProjectionInputs<'a> {
             let relative = 1.0 + lamp.factor_error(point) / UNIT;
             lamp.steepness() * lamp.factor(point) * relative * color
         };
-        let color = self.lamp.map_or(color, lit);
+        let color = self.lamp.map_or(color, lit) * self.tint.truncate().max_element().max(1.0);
+        let far = far * self.camera.rotation.x_axis.length().max(1.0);
         let dimmed = 32.0 * projection.conditioning;
         let level = f64::from(splat_level(opacity as f32));
         let extent =
@@ -272,62 +319,81 @@ impl<'a> ProjectionInputs<'a> {
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { parameters, splats, colors, depth_keys, ids, tile_counts, .. } = slices;
-        let scene = ProjectionInputs::new(params, constants, slices.cameras, slices.lamp);
-        let (planes, parameters) = scene.planes.floats(parameters, constants.half_rest);
         let stored = stored_color(constants.channels);
-        for i in 0..scene.planes.count {
-            ids[i] = params.first_gaussian + i as u32;
-            depth_keys[i] = CULLED;
-            tile_counts[i] = 0;
-            let gaussian = planes.load(&parameters, i);
-            let Some(projection) = scene.project(&gaussian) else { continue };
-            splats[i] = projection.stored();
-            let depth = (constants.view_depths != 0).then_some(projection.depth);
-            let values = projection.color.to_array().into_iter().chain(gaussian.features);
-            let values = values.chain(depth).chain(std::iter::repeat(0.0));
-            for (color, value) in colors[stored * i..][..stored].iter_mut().zip(values) {
-                *color = value as f32;
-            }
-            tile_counts[i] = tile_count(scene.size, constants, &splats[i]);
-            if tile_counts[i] > 0 {
-                depth_keys[i] = depth_key(projection.depth as f32, params.near);
+        for instance in instances(params, constants, slices.instances) {
+            let scene =
+                ProjectionInputs::new(params, constants, slices.cameras, slices.lamp, instance);
+            let (planes, floats) = scene.planes.floats(parameters, constants.half_rest);
+            let whole = Kernel::INTERFACE.workgroup_size[0] as usize;
+            let count = scene.planes.count;
+            for k in 0..if constants.instances { count.next_multiple_of(whole) } else { count } {
+                let i = scene.first + k;
+                let first =
+                    if constants.instances { params.first_splat } else { params.first_gaussian };
+                ids[i] = first + i as u32;
+                depth_keys[i] = CULLED;
+                tile_counts[i] = 0;
+                if k >= scene.planes.count {
+                    continue;
+                }
+                let gaussian = planes.load(&floats, k);
+                if scene.is_clipped(&gaussian) {
+                    continue;
+                }
+                let Some(projection) = scene.project(&gaussian) else { continue };
+                splats[i] = projection.stored();
+                let depth = (constants.view_depths != 0).then_some(projection.depth);
+                let values = projection.color.to_array().into_iter().chain(gaussian.features);
+                let values = values.chain(depth).chain(std::iter::repeat(0.0));
+                for (color, value) in colors[stored * i..][..stored].iter_mut().zip(values) {
+                    *color = value as f32;
+                }
+                tile_counts[i] = tile_count(scene.size, constants, &splats[i]);
+                if tile_counts[i] > 0 {
+                    depth_keys[i] = depth_key(projection.depth as f32, params.near);
+                }
             }
         }
     }
 
     /// A Gaussian close to the culling limit may be culled; one whose ellipse is close to a tile may cover it.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let scene = ProjectionInputs::new(params, constants, slices.cameras, slices.lamp);
-        let (planes, parameters) = scene.planes.floats(slices.parameters, constants.half_rest);
-        let (n, stored) = (scene.planes.count, stored_color(constants.channels));
+        let stored = stored_color(constants.channels);
+        let n = slices.ids.len();
         let [mut splats, mut colors, mut depth_keys, mut tile_counts] =
             [8 * n, stored * n, n, n].map(|len| vec![0.0; len]);
-        for i in 0..n {
-            let gaussian = planes.load(&parameters, i);
-            let Some(errors) = scene.errors(&gaussian) else {
-                splats[8 * i..][..8].fill(f64::INFINITY);
-                colors[stored * i..][..stored].fill(f64::INFINITY);
-                (depth_keys[i], tile_counts[i]) = (f64::INFINITY, f64::INFINITY);
-                continue;
-            };
-            let Some(projection) = scene.project(&gaussian) else { continue };
-            splats[8 * i..][..8].copy_from_slice(&errors[..8]);
-            colors[stored * i..][..3].copy_from_slice(&errors[8..11]);
-            if constants.view_depths != 0 {
-                colors[stored * i + constants.channels as usize - 1] = errors[11];
+        for instance in instances(params, constants, slices.instances) {
+            let scene =
+                ProjectionInputs::new(params, constants, slices.cameras, slices.lamp, instance);
+            let (planes, floats) = scene.planes.floats(slices.parameters, constants.half_rest);
+            for k in 0..scene.planes.count {
+                let i = scene.first + k;
+                let gaussian = planes.load(&floats, k);
+                if scene.is_clipped(&gaussian) {
+                    continue;
+                }
+                let Some(errors) = scene.errors(&gaussian) else {
+                    splats[8 * i..][..8].fill(f64::INFINITY);
+                    colors[stored * i..][..stored].fill(f64::INFINITY);
+                    (depth_keys[i], tile_counts[i]) = (f64::INFINITY, f64::INFINITY);
+                    continue;
+                };
+                let Some(projection) = scene.project(&gaussian) else { continue };
+                splats[8 * i..][..8].copy_from_slice(&errors[..8]);
+                colors[stored * i..][..3].copy_from_slice(&errors[8..11]);
+                if constants.view_depths != 0 {
+                    colors[stored * i + constants.channels as usize - 1] = errors[11];
+                }
+                let splat = projection.stored();
+                let count = tile_count(scene.size, constants, &splat);
+                let [fewest, most] = scene.tile_counts(&splat, &errors);
+                tile_counts[i] = (count - count.min(fewest)).max(most.max(count) - count).into();
+                depth_keys[i] = match (fewest, most) {
+                    (_, 0) => 0.0,
+                    (0, _) => f64::INFINITY,
+                    _ => key_error(projection.depth as f32, errors[11]),
+                };
             }
-            let splat = projection.stored();
-            let count = tile_count(scene.size, constants, &splat);
-            let [fewest, most] = scene.tile_counts(&splat, &errors);
-            tile_counts[i] = (count - count.min(fewest)).max(most.max(count) - count).into();
-            // The keys of positive numbers differ by sixteenths of their difference in units in the last place.
-            let depth = projection.depth as f32;
-            let last_place = f64::from(depth.next_up()) - f64::from(depth);
-            depth_keys[i] = match (fewest, most) {
-                (_, 0) => 0.0,
-                (0, _) => f64::INFINITY,
-                _ => 1.0 + (1.0 + errors[11] / last_place) / 16.0,
-            };
         }
         Tolerances {
             splats: Tolerance::Each(splats),

@@ -21,6 +21,7 @@ mod draw;
 #[cfg(feature = "train")]
 mod gradients;
 mod images;
+mod instances;
 mod lamp;
 mod limits;
 mod pipelines;
@@ -50,6 +51,7 @@ pub use draw::Drawn;
 use draw::HostTargets;
 #[cfg(feature = "train")]
 pub(crate) use gradients::ViewGradients;
+pub use instances::Instance;
 pub(crate) use lamp::DeviceLamp;
 use pipelines::{ProjectionKind, Projections, WrittenGradients};
 pub use settings::{Purpose, RenderSettings};
@@ -228,12 +230,25 @@ impl Renderer {
         self.check(&gaussians.layout)?;
         let view = self.view(&viewpoint, depths.is_some())?;
         let gaussian_count = (self.context_count() + gaussians.layout.count) as u32;
-        pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
         if viewpoint.on_device.is_none() {
             pass.update(&mut self.frame.camera, &[(&viewpoint.patch).into()])?;
         }
         self.record_project(pass, gaussians, &view, options.sh_degree)?;
-        self.record_bins(pass, gaussian_count, &view, capacity)?;
+        self.record_splats(pass, gaussian_count, &view, options, depths, capacity)
+    }
+
+    /// Records what follows the projection of the Gaussians of a view.
+    fn record_splats(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussian_count: u32,
+        view: &KernelView<'_>,
+        options: &RenderOptions,
+        depths: Option<DepthChannel>,
+        capacity: Option<u32>,
+    ) -> Result<()> {
+        pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
+        self.record_bins(pass, gaussian_count, view, capacity)?;
         let mut background = [0.0; MAX_CHANNELS as usize];
         background[..3].copy_from_slice(&options.background);
         let frame = &mut self.frame;
@@ -373,6 +388,9 @@ impl Renderer {
                         gaussian_count: batch.gaussian_count(),
                         sh_degree,
                         first_gaussian: rendered.first_gaussian(),
+                        first_instance: 0,
+                        instance_count: 0,
+                        first_splat: 0,
                     },
                     project::Buffers {
                         parameters: batch.rows(parameters, layout.words())?,
@@ -383,6 +401,7 @@ impl Renderer {
                         tile_counts: rendered.rows_mut(&mut frame.tile_counts, 1)?,
                         cameras: view.cameras.unwrap_or(&frame.camera).slice(),
                         lamp: lamp::bound(lamp.as_ref(), parameters)?,
+                        instances: frame.instances.slice(),
                     },
                     Threads::Exactly([batch.gaussian_count(), 1, 1]),
                 )?;
@@ -445,7 +464,8 @@ impl Renderer {
             );
             return Err(Error::Usage(what));
         }
-        let kind = ProjectionKind { camera_model: model_number(&patch.camera.model), view_depths };
+        let camera_model = model_number(&patch.camera.model);
+        let kind = ProjectionKind { camera_model, view_depths, instances: None };
         self.build_projections(kind)?;
         let (cameras, camera_index) = on_device.unzip();
         let camera_index = camera_index.unwrap_or_default();

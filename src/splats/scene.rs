@@ -22,6 +22,8 @@ use crate::splats::attributes::{AttributePlane, column_count, planes};
 use crate::splats::harmonics::HarmonicRotation;
 #[cfg(feature = "train")]
 pub(crate) use change::{Lengths, is_far};
+#[doc(hidden)]
+pub use device::Bounds;
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
 pub use facts::ModelFacts;
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};

@@ -3,6 +3,7 @@
 #![expect(unsafe_code, reason = "plays a host application, which calls Vulkan itself")]
 
 mod frames;
+mod instances;
 mod kernels;
 pub(crate) mod photograph;
 

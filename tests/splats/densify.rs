@@ -291,7 +291,7 @@ fn a_buffer_that_is_too_short_is_refused() {
         let planes = |index| gpu.zeros("planes", len(index, 28)).unwrap();
         let layout = Layout::new(2, 0, StorageFormat::Single);
         let (parameters, origin) = (planes(0), DVec3::ZERO);
-        let mut gaussians = DeviceGaussians { layout, parameters, origin };
+        let mut gaussians = DeviceGaussians { layout, parameters, origin, bounds: None };
         let mut moments = Moments::Single { first: planes(1), second: planes(2) };
         let inputs = DensifyInputs {
             moments: &mut moments,

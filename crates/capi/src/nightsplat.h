@@ -46,6 +46,12 @@
 // linear image, encoded values otherwise. `background` is not changed.
 #define NSP_RENDER_PHOTOGRAPH 32
 
+// The instance is not drawn.
+#define NSP_INSTANCE_HIDDEN 1
+
+// Splats whose centres are outside of `clip_min` to `clip_max` are not drawn.
+#define NSP_INSTANCE_CLIP 2
+
 // A device. Any thread may use it.
 typedef struct NspDevice NspDevice;
 
@@ -229,6 +235,28 @@ typedef struct NspImage {
     struct NspImageState after;
 } NspImage;
 
+// A model in a render of several. One model can have many instances; it is uploaded once.
+typedef struct NspInstance {
+    // `sizeof(NspInstance)`; in an array, the distance between elements.
+    size_t struct_size;
+    // The model.
+    const struct NspModel *model;
+    // The rigid transform from the model's world to that of the cameras, three rows of four; all zeros: none.
+    double pose[12];
+    // The factor on lengths of the model, before the pose; 0 stands for 1.
+    double scale;
+    // Factors of display-referred red, green and blue, 0 or more, and of the opacity, 0 to 1; all zeros stand for ones.
+    float tint[4];
+    // The least corner of the clip box, in the model's world.
+    double clip_min[3];
+    // The greatest corner of the clip box.
+    double clip_max[3];
+    // `NSP_INSTANCE_*`.
+    uint32_t flags;
+    // Unused.
+    uint32_t reserved;
+} NspInstance;
+
 // The parameters of a render.
 typedef struct NspRender {
     // `sizeof(NspRender)`.
@@ -261,8 +289,10 @@ typedef struct NspRender {
     // The most intersections of splats and tiles in a view, of which the farthest are left out first; 0: as memory
     // allows.
     uint32_t budget;
-    // Unused.
-    uint32_t reserved;
+    // The number of instances.
+    uint32_t instance_count;
+    // The models that are drawn, sorted together; NULL: the model that is passed.
+    const struct NspInstance *instances;
 } NspRender;
 
 // The outcome of the newest frame that is done.
@@ -425,11 +455,13 @@ NspResult nsp_renderer_create(struct NspDevice *device, const struct NspModel *m
 // Allocates memory for views of this size and for this many intersections, ahead of the first recording.
 NspResult nsp_renderer_reserve(struct NspRenderer *renderer, uint32_t width, uint32_t height, uint32_t intersections);
 
-// Records the render of a model. Nothing is submitted, and nothing is waited for. If the view needs more memory than
+// Records the render of a model, or of `NspRender::instances` if `model` is NULL. Nothing is submitted, and nothing is waited for. If the view needs more memory than
 // there is, the nearest splats are drawn, and a later call allocates more.
 //
 // It binds compute pipelines, descriptor set 0 and push constants, and restores none of them.
-NspResult nsp_record_render(struct NspRenderer *renderer, const struct NspModel *model, const struct NspRender *render);
+NspResult nsp_record_render(struct NspRenderer *renderer,
+                            const struct NspModel *model,
+                            const struct NspRender *render);
 
 // Writes the outcome of the newest frame that is done to `status`. It never waits.
 NspResult nsp_renderer_status(const struct NspRenderer *renderer, struct NspStatus *status);

@@ -6,14 +6,17 @@ pub use ash::vk::{
     AccessFlags2 as VkAccessFlags2, Extent2D as VkExtent2D, Format as VkFormat, Image as VkImage,
     ImageLayout as VkImageLayout, PipelineStageFlags2 as VkPipelineStageFlags2,
 };
+use glam::{DAffine3, DVec3};
 use nightsplat::gpu::{Gpu, HostFrame, HostImage, ImageFormat, ImageState};
+use nightsplat::splats::model::Model;
 use nightsplat::splats::render::{
-    DepthConvention, DepthKind, Purpose, RenderOptions, RenderSettings, Renderer, SceneDepth,
-    Target,
+    DepthConvention, DepthKind, Instance, Purpose, RenderOptions, RenderSettings, Renderer,
+    SceneDepth, Target,
 };
+use nightsplat::splats::scene::MAX_SH_DEGREE;
 use nightsplat_core::camera::Camera;
 
-use super::camera::NspCamera;
+use super::camera::{NspCamera, affine};
 use super::device::{NspDevice, VkCommandBuffer};
 use super::error::{Failure, NspResult, Object, guard};
 use super::model::{LoadedModel, NspModel};
@@ -28,8 +31,9 @@ struct Shown {
     gpu: Gpu,
     renderer: Renderer,
     sh_degree: u32,
-    /// Of the model that it was made for.
+    /// Of the model that it was made for, as below.
     gaussian_count: usize,
+    appearance: (bool, f32, bool),
 }
 
 /// The state of an image before or after a recording.
@@ -103,6 +107,41 @@ const FLAGS: u32 = NSP_RENDER_OVER
     | NSP_DEPTH_LINEAR
     | NSP_DEPTH_EXPECTED;
 
+/// The instance is not drawn.
+pub const NSP_INSTANCE_HIDDEN: u32 = 1;
+/// Splats whose centres are outside of `clip_min` to `clip_max` are not drawn.
+pub const NSP_INSTANCE_CLIP: u32 = 2;
+
+/// A model in a render of several. One model can have many instances; it is uploaded once.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct NspInstance {
+    /// `sizeof(NspInstance)`; in an array, the distance between elements.
+    pub struct_size: usize,
+    /// The model.
+    pub model: *const NspModel,
+    /// The rigid transform from the model's world to that of the cameras, three rows of four; all zeros: none.
+    pub pose: [f64; 12],
+    /// The factor on lengths of the model, before the pose; 0 stands for 1.
+    pub scale: f64,
+    /// Factors of display-referred red, green and blue, 0 or more, and of the opacity, 0 to 1; all zeros stand for ones.
+    pub tint: [f32; 4],
+    /// The least corner of the clip box, in the model's world.
+    pub clip_min: [f64; 3],
+    /// The greatest corner of the clip box.
+    pub clip_max: [f64; 3],
+    /// `NSP_INSTANCE_*`.
+    pub flags: u32,
+    /// Unused.
+    pub reserved: u32,
+}
+
+// SAFETY: the size comes first; null pointers are zeros.
+unsafe impl Sized0 for NspInstance {
+    const NAME: &'static str = "NspInstance";
+    const FIRST_SIZE: usize = size_of::<Self>();
+}
+
 /// The parameters of a render.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
@@ -137,8 +176,10 @@ pub struct NspRender {
     /// The most intersections of splats and tiles in a view, of which the farthest are left out first; 0: as memory
     /// allows.
     pub budget: u32,
-    /// Unused.
-    pub reserved: u32,
+    /// The number of instances.
+    pub instance_count: u32,
+    /// The models that are drawn, sorted together; NULL: the model that is passed.
+    pub instances: *const NspInstance,
 }
 
 // SAFETY: the size comes first; null handles and pointers are zeros.
@@ -198,10 +239,16 @@ pub unsafe extern "C" fn nsp_renderer_create(
                     renderer,
                     sh_degree: model.gaussians.shape.sh_degree,
                     gaussian_count: model.gaussians.count,
+                    appearance: appearance(model),
                 })))
             })
         }
     })
+}
+
+/// What models of one render have in common.
+fn appearance(model: &Model) -> (bool, f32, bool) {
+    (model.raw_colors, model.max_alpha, model.antialiased)
 }
 
 fn check_device(
@@ -235,7 +282,7 @@ pub unsafe extern "C" fn nsp_renderer_reserve(
     })
 }
 
-/// Records the render of a model. Nothing is submitted, and nothing is waited for. If the view needs more memory than
+/// Records the render of a model, or of `NspRender::instances` if `model` is NULL. Nothing is submitted, and nothing is waited for. If the view needs more memory than
 /// there is, the nearest splats are drawn, and a later call allocates more.
 ///
 /// It binds compute pipelines, descriptor set 0 and push constants, and restores none of them.
@@ -250,11 +297,9 @@ pub unsafe extern "C" fn nsp_record_render(
 ) -> NspResult {
     guard("nsp_record_render", || {
         // SAFETY: as the caller promises.
-        let (renderer, model, render) =
-            unsafe { (object_mut(renderer, "renderer")?, object(model, "model")?, read(render)?) };
-        let loaded = model.0.get("the model")?;
+        let (renderer, render) = unsafe { (object_mut(renderer, "renderer")?, read(render)?) };
         // SAFETY: as the caller promises.
-        renderer.0.with("the renderer", |shown| unsafe { record(shown, loaded, &render) })
+        renderer.0.with("the renderer", |shown| unsafe { record(shown, model, &render) })
     })
 }
 
@@ -262,10 +307,11 @@ pub unsafe extern "C" fn nsp_record_render(
 /// `render` says the truth.
 unsafe fn record(
     shown: &mut Shown,
-    loaded: &LoadedModel,
+    model: *const NspModel,
     render: &NspRender,
 ) -> Result<(), Failure> {
-    check_device(&shown.gpu, &loaded.on_device)?;
+    // SAFETY: as the caller promises.
+    let models = &unsafe { models(shown, model, render) }?;
     if render.commands == vk::CommandBuffer::null() {
         return Err(Failure::usage("NspRender::commands is NULL"));
     }
@@ -275,9 +321,6 @@ unsafe fn record(
     }
     if render.camera_count == 0 || render.cameras.is_null() {
         return Err(Failure::usage("NspRender::cameras is NULL or empty"));
-    }
-    if render.reserved != 0 {
-        return Err(Failure::usage(format!("NspRender::reserved is {}, not 0", render.reserved)));
     }
     // SAFETY: as the caller promises.
     let (color, depth, scene, cameras) = unsafe {
@@ -310,18 +353,101 @@ unsafe fn record(
         exposure: if render.exposure == 0.0 { 1.0 } else { render.exposure },
         budget: render.budget,
     };
-    let options = RenderOptions { sh_degree: shown.sh_degree, background: render.background };
+    let sh_degree = match models {
+        Models::One(_) => shown.sh_degree,
+        Models::Instances(_) => MAX_SH_DEGREE,
+    };
+    let options = RenderOptions { sh_degree, background: render.background };
     let frame = HostFrame { commands: render.commands.as_raw(), number: render.frame, readers: 0 };
     let Shown { gpu, renderer, .. } = shown;
     // What can fail does so before anything is recorded.
-    renderer.prepare_draw(&loaded.on_device.layout, &cameras, &target)?;
+    match models {
+        Models::One(loaded) => {
+            renderer.prepare_draw(&loaded.on_device.layout, &cameras, &target)?;
+        }
+        Models::Instances(all) => renderer.prepare_instances(all, &cameras, &target)?,
+    }
     // SAFETY: as the caller promises.
     unsafe {
-        gpu.record_into(&frame, |pass| {
-            renderer.draw(pass, &loaded.on_device, &cameras, &options, &target)
+        gpu.record_into(&frame, |pass| match models {
+            Models::One(loaded) => {
+                renderer.draw(pass, &loaded.on_device, &cameras, &options, &target)
+            }
+            Models::Instances(all) => {
+                renderer.draw_instances(pass, all, &cameras, &options, &target)
+            }
         })
     }?;
     Ok(())
+}
+
+/// What a render draws.
+enum Models<'a> {
+    One(&'a LoadedModel),
+    Instances(Vec<Instance<'a>>),
+}
+
+/// # Safety
+/// `model` is NULL or valid, and `render` says the truth.
+unsafe fn models<'a>(
+    shown: &Shown,
+    model: *const NspModel,
+    render: &NspRender,
+) -> Result<Models<'a>, Failure> {
+    let NspRender { instances, instance_count, .. } = *render;
+    match (model.is_null(), instances.is_null()) {
+        // SAFETY: as the caller promises.
+        (false, true) if instance_count == 0 => {
+            let model = unsafe { object(model, "model") }?;
+            let loaded = model.0.get("the model")?;
+            check_device(&shown.gpu, &loaded.on_device)?;
+            Ok(Models::One(loaded))
+        }
+        (true, true) => Err(Failure::usage("model is NULL, and there are no NspRender::instances")),
+        (true, false) => {
+            let all = match instance_count {
+                0 => vec![],
+                // SAFETY: as the caller promises.
+                _ => unsafe { read_all(instances, instance_count) }?,
+            };
+            // SAFETY: as the caller promises.
+            let each = |(at, instance)| unsafe { lent_instance(shown, at, instance) };
+            Ok(Models::Instances(all.iter().enumerate().map(each).collect::<Result<_, _>>()?))
+        }
+        _ => Err(Failure::usage("both a model and NspRender::instances; pass one of them")),
+    }
+}
+
+/// # Safety
+/// The model is NULL or valid.
+unsafe fn lent_instance<'a>(
+    shown: &Shown,
+    at: usize,
+    instance: &NspInstance,
+) -> Result<Instance<'a>, Failure> {
+    const FLAGS: u32 = NSP_INSTANCE_HIDDEN | NSP_INSTANCE_CLIP;
+    if instance.flags & !FLAGS != 0 || instance.reserved != 0 {
+        let text = format!("instance {at} has unknown flags, or reserved is not 0");
+        return Err(Failure::usage(text));
+    }
+    // SAFETY: as the caller promises.
+    let model = unsafe { object(instance.model, &format!("the model of instance {at}")) }?;
+    let LoadedModel { model, on_device } = model.0.get("a model")?;
+    check_device(&shown.gpu, on_device)?;
+    if appearance(model) != shown.appearance {
+        return Err(Failure::usage(format!(
+            "the model of instance {at} has other colours, alpha limit or antialiasing than that of the renderer"
+        )));
+    }
+    let corners = [instance.clip_min, instance.clip_max].map(DVec3::from);
+    Ok(Instance {
+        pose: if instance.pose == [0.0; 12] { DAffine3::IDENTITY } else { affine(&instance.pose) },
+        scale: if instance.scale == 0.0 { 1.0 } else { instance.scale },
+        tint: if instance.tint == [0.0; 4] { [1.0; 4] } else { instance.tint },
+        clip: (instance.flags & NSP_INSTANCE_CLIP != 0).then_some(corners),
+        is_visible: instance.flags & NSP_INSTANCE_HIDDEN == 0,
+        ..Instance::new(on_device)
+    })
 }
 
 /// # Safety

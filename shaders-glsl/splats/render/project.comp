@@ -7,6 +7,7 @@
 #include "sh.glsl"
 #include "splat.glsl"
 #include "lamp.glsl"
+#include "instance.glsl"
 
 //! Project: one thread per Gaussian, world space to image plane.
 //!
@@ -17,6 +18,10 @@
 //! bare SH sum of LITA-GS, in the light of the lamp (include/lamp.glsl) before it is clamped; features are taken as
 //! they are. The last channel can be the depth in the view. A culled
 //! Gaussian gets the last depth key and covers no tile.
+//!
+//! With INSTANCES, the Gaussians are projected once for each of several instances of their model: a dispatch has the
+//! workgroups of the first instance, then those of the next, and each has whole workgroups of splats, the last of which
+//! may be culled for want of a Gaussian. The direction that SH are evaluated in is the model's.
 
 layout(local_size_x = 64) in;
 
@@ -26,6 +31,9 @@ layout(push_constant, scalar) uniform Params {
     uint  gaussian_count;
     uint  sh_degree;  // in use; at most SH_DEGREE
     uint  first_gaussian;  // Gaussians before those of this dispatch
+    uint  first_instance;  // with INSTANCES
+    uint  instance_count;
+    uint  first_splat;     // that is bound
 };
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
@@ -33,6 +41,7 @@ layout(constant_id = 5) const bool RAW_COLORS = false;
 layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in the format of include/half.glsl
 layout(constant_id = 14) const bool ANTIALIASED = false;  // opacities are compensated for the dilation
 layout(constant_id = 16) const bool LAMP = false;  // colours are lit by a lamp at the camera
+layout(constant_id = 17) const bool INSTANCES = false;
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // planes
 layout(binding = 1) writeonly buffer Splats     { ProjectedSplat splats[]; };
@@ -42,6 +51,7 @@ layout(binding = 4) writeonly buffer Ids        { uint ids[]; };
 layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };
 layout(binding = 6) readonly  buffer Cameras    { Camera cameras[]; };
 layout(binding = 7) readonly  buffer LampNumbers { float lamp[]; };  // (LAMP_NUMBERS), read with LAMP
+layout(binding = 8) readonly  buffer Instances  { InstanceView instances[]; };  // read with INSTANCES
 
 // A depth key is how many sixteenfold roundings the depth is beyond `near`: 2e-6 of the depth each, over 32 octaves.
 const uint DEPTH_BITS = 24;
@@ -77,23 +87,47 @@ vec3 shown(vec3 color) {
 }
 
 void main() {
-    uint i = THREAD_INDEX;
-    if (i >= gaussian_count) return;
-    ids[i] = first_gaussian + i;
-    depth_keys[i] = CULLED;
-    tile_counts[i] = 0;
+    uint i = THREAD_INDEX, instance = 0;
+    if (INSTANCES) {
+        uint groups = (gaussian_count + gl_WorkGroupSize.x - 1) / gl_WorkGroupSize.x;
+        instance = WORKGROUP_INDEX / groups;
+        if (instance >= instance_count) return;
+        i -= gl_WorkGroupSize.x * groups * instance;
+        instance += first_instance;
+    } else if (i >= gaussian_count) {
+        return;
+    }
+    uint slot = i, first = first_gaussian;  // of the splats
+    if (INSTANCES) {
+        slot += instances[instance].first + first_gaussian;
+        first = first_splat;
+    }
+    ids[slot] = first + slot;
+    depth_keys[slot] = CULLED;
+    tile_counts[slot] = 0;
+    if (INSTANCES) {
+        if (i >= gaussian_count) return;
+    }
 
     Camera camera = cameras[camera_index];
+    mat4x3 view = camera.view_from_world;
+    if (INSTANCES) view = instances[instance].view_from_model;
     vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
-    vec3 mean_in_view = camera.view_from_world * vec4(mean, 1.0);
+    vec3 mean_in_view = view * vec4(mean, 1.0);
     float opacity = sigmoid(parameters[RAW_OPACITIES_COLUMN * gaussian_count + i]);
+    if (INSTANCES) {
+        opacity *= instances[instance].tint.a;
+        bvec3 is_above = greaterThanEqual(mean, instances[instance].box_min);
+        bvec3 is_below = lessThanEqual(mean, instances[instance].box_max);
+        if (!(all(is_above) && all(is_below))) return;
+    }
     float depth = camera_depth(mean_in_view, camera);
     // Positive phrasing: a NaN depth or opacity fails the test too.
     if (!(depth > near && opacity > ALPHA_MIN)) return;
 
     mat3 world_axes = rotation(unit_quat(LOAD_VEC4(parameters, QUATS_COLUMN, gaussian_count, i)));
     vec3 scale = exp(LOAD_VEC3(parameters, LOG_SCALES_COLUMN, gaussian_count, i));
-    mat3 view_axes = mat3(camera.view_from_world) * world_axes;
+    mat3 view_axes = mat3(view) * world_axes;
     for (uint k = 0; k < 3; k++) view_axes[k] *= scale[k];
     mat3 rows = transpose(view_axes);  // row k of W R S as rows[.][k]
     Jacobian jacobian = camera_jacobian(mean_in_view, camera);
@@ -117,9 +151,10 @@ void main() {
     splat.conic = vec3(cov2d.z, -cov2d.y, cov2d.x) / det;
     splat.opacity = opacity;
     splat.half_extent = sqrt(splat_level(opacity) * cov2d.xz) + 0.01;
-    splats[i] = splat;
+    splats[slot] = splat;
 
-    vec3 center = -transpose(mat3(camera.view_from_world)) * camera.view_from_world[3];
+    vec3 center = -transpose(mat3(view)) * view[3];
+    if (INSTANCES) center = instances[instance].camera_center;
     vec3 offset = mean - center;
     vec3 rgb = sh_color(i, normalize(offset * finite_scale(length(offset))));
     if (LAMP) {
@@ -127,6 +162,7 @@ void main() {
         rgb = lamp_lit(loaded, lamp_factor(loaded, lamp_at(loaded, mean_in_view)), rgb);
     }
     rgb = shown(rgb);
+    if (INSTANCES) rgb *= instances[instance].tint.rgb;
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
     [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) {
         vec4 four = vec4(0);
@@ -136,7 +172,7 @@ void main() {
             else if (channel < 3 + FEATURE_COUNT) four[c] = parameters[features + channel - 3];
             else if (VIEW_DEPTHS != 0 && channel == 3 + FEATURE_COUNT) four[c] = depth;
         }
-        colors[COLOR_VECTORS * i + k] = four;
+        colors[COLOR_VECTORS * slot + k] = four;
     }
 
     uint count = 0;
@@ -145,6 +181,6 @@ void main() {
         uvec2 columns = splat_tiles(splat, row, camera.size.x);
         count += columns.y - columns.x;
     }
-    tile_counts[i] = count;
-    if (count > 0) depth_keys[i] = depth_key(depth);
+    tile_counts[slot] = count;
+    if (count > 0) depth_keys[slot] = depth_key(depth);
 }

@@ -9,7 +9,7 @@ use crate::kernels::splat::RECORD_HEAD;
 use crate::kernels::status::{
     STATUS_GRADIENT, STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_TILE_LIMIT, STATUS_WORDS,
 };
-use crate::kernels::{self, ProjectedSplat};
+use crate::kernels::{self, InstanceView, ProjectedSplat};
 
 /// The first estimate of tiles per Gaussian; a view that needs more grows the memory.
 const TILES_PER_GAUSSIAN: u32 = 6;
@@ -84,6 +84,8 @@ pub struct RenderBuffers {
     pub tile_ranges: Buffer<UVec2>,
     /// The camera of a view without a camera in another buffer.
     pub camera: Buffer<kernels::Camera>,
+    /// As that camera sees them.
+    pub instances: Buffer<InstanceView>,
     // single numbers
     pub counts: Buffer<u32>,
     pub status: Buffer<u32>,
@@ -123,6 +125,7 @@ impl RenderBuffers {
             transmittances: gpu.uninit("transmittances", 0)?,
             tile_ranges: gpu.uninit("tile_ranges", 0)?,
             camera: gpu.zeros("camera", 1)?,
+            instances: gpu.zeros("instances", 1)?,
             counts: gpu.zeros("counts", 1)?,
             status: gpu.zeros("status", STATUS_WORDS as usize)?,
             arrivals: gpu.zeros("arrivals", 1)?,

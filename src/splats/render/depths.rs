@@ -23,7 +23,11 @@ impl Renderer {
         self.frame.set_channels(&self.gpu, self.settings.channels() + 1)?;
         self.reserve(gaussians.layout.count, [camera])?;
         let camera_model = model_number(&camera.model);
-        self.build_projections(ProjectionKind { camera_model, view_depths: true })?;
+        self.build_projections(ProjectionKind {
+            camera_model,
+            view_depths: true,
+            instances: None,
+        })?;
         self.build_blending(true)?;
         let whole = Patch::from(camera);
         let mut depths = vec![f32::INFINITY; whole.pixel_count()];

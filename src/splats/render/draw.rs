@@ -5,6 +5,7 @@
 
 use nightsplat_core::camera::{Camera, Patch};
 
+use super::instances::{Instance, VisibleInstances, layout_of};
 use super::target::Target;
 use super::{DepthChannel, ProjectionKind, RenderOptions, Renderer};
 use crate::Result;
@@ -76,6 +77,13 @@ impl HostTargets {
     }
 }
 
+/// What a draw shows.
+#[derive(Clone, Copy)]
+enum Drawing<'a> {
+    Model(GaussianSlice<'a>),
+    Instances(&'a [Instance<'a>]),
+}
+
 impl Renderer {
     /// Records the render of `gaussians` from each camera into the layers of the target's images. Takes each image
     /// from its state `before` and leaves it in its state `after`. Binds compute pipelines, descriptor set 0 and push
@@ -93,11 +101,38 @@ impl Renderer {
         target: &Target<'_>,
     ) -> Result<()> {
         let gaussians = gaussians.into();
-        Target::check_background(options.background)?;
         self.prepare_draw(&gaussians.layout, cameras, target)?;
+        self.draw_layers(pass, Drawing::Model(gaussians), cameras, options, target)
+    }
+
+    /// Records the render of several models, sorted together, as [`Renderer::draw`] does that of one.
+    ///
+    /// # Errors
+    /// As [`Renderer::draw`]; an instance does not fit the renderer's settings.
+    pub fn draw_instances(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        instances: &[Instance<'_>],
+        cameras: &[Camera],
+        options: &RenderOptions,
+        target: &Target<'_>,
+    ) -> Result<()> {
+        self.prepare_instances(instances, cameras, target)?;
+        self.draw_layers(pass, Drawing::Instances(instances), cameras, options, target)
+    }
+
+    fn draw_layers(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        drawing: Drawing<'_>,
+        cameras: &[Camera],
+        options: &RenderOptions,
+        target: &Target<'_>,
+    ) -> Result<()> {
+        Target::check_background(options.background)?;
         self.clear_status(pass);
         for (layer, camera) in (0..).zip(cameras) {
-            self.draw_layer(pass, gaussians, camera, layer, options, target)?;
+            self.draw_layer(pass, drawing, camera, layer, options, target)?;
         }
         let capacity = self.drawn_capacity(target);
         let Self { frame, host_targets, .. } = self;
@@ -143,7 +178,8 @@ impl Renderer {
         for camera in cameras {
             let camera_model = model_number(&camera.model);
             let view_depths = target.needs_depths();
-            self.build_projections(ProjectionKind { camera_model, view_depths })?;
+            let kind = ProjectionKind { camera_model, view_depths, instances: None };
+            self.build_projections(kind)?;
         }
         self.build_blending(target.needs_depths())?;
         if target.scene.is_some() {
@@ -162,6 +198,30 @@ impl Renderer {
         }
         self.grow_as_drawn();
         self.reserve_sorts()
+    }
+
+    /// [`Renderer::prepare_draw`] of [`Renderer::draw_instances`].
+    ///
+    /// # Errors
+    /// As [`Renderer::draw_instances`].
+    pub fn prepare_instances(
+        &mut self,
+        instances: &[Instance<'_>],
+        cameras: &[Camera],
+        target: &Target<'_>,
+    ) -> Result<()> {
+        let layout = layout_of(instances, &self.settings)?;
+        self.prepare_draw(&layout, cameras, target)?;
+        self.frame.instances.grow(&self.gpu, instances.len())?;
+        let view_depths = target.needs_depths();
+        for camera in cameras {
+            let camera_model = model_number(&camera.model);
+            for instance in instances {
+                let instances = Some(instance.gaussians.layout.shape.sh_degree);
+                self.build_projections(ProjectionKind { camera_model, view_depths, instances })?;
+            }
+        }
+        Ok(())
     }
 
     /// Takes memory for this many Gaussians, views of this size and this many intersections ahead of the first draw.
@@ -207,7 +267,7 @@ impl Renderer {
     fn draw_layer(
         &mut self,
         pass: &mut Recorder<'_>,
-        gaussians: GaussianSlice<'_>,
+        drawing: Drawing<'_>,
         camera: &Camera,
         layer: u32,
         options: &RenderOptions,
@@ -228,7 +288,26 @@ impl Renderer {
         let capacity = self.drawn_capacity(target);
         // The background is mixed in as the image counts colours.
         let before_black = RenderOptions { background: [0.0; 3], ..*options };
-        self.record_forward(pass, gaussians, camera, &before_black, depths, Some(capacity))?;
+        match drawing {
+            Drawing::Model(gaussians) => {
+                self.record_forward(
+                    pass,
+                    gaussians,
+                    camera,
+                    &before_black,
+                    depths,
+                    Some(capacity),
+                )?;
+            }
+            Drawing::Instances(instances) => {
+                let visible = VisibleInstances::new(instances, camera, &self.settings);
+                let view = self.view(&camera.into(), depths.is_some())?;
+                pass.update(&mut self.frame.camera, &[(&Patch::from(camera)).into()])?;
+                self.record_instances(pass, &visible, &view, options.sh_degree)?;
+                let count = visible.count as u32;
+                self.record_splats(pass, count, &view, &before_black, depths, Some(capacity))?;
+            }
+        }
         if target.is_photograph && color.is_some() {
             self.record_photograph(pass, pixel_count)?;
         }

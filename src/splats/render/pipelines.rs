@@ -62,6 +62,7 @@ impl Renderer {
         let pinhole = ProjectionKind {
             camera_model: model_number(&CameraModel::Pinhole),
             view_depths: false,
+            instances: None,
         };
         let frozen_columns = gradients.frozen_columns;
         let lamp = settings.lamp;
@@ -182,6 +183,9 @@ pub(super) struct ProjectionKind {
     pub(super) camera_model: u32,
     /// Whether the last channel is the depth in the view.
     pub(super) view_depths: bool,
+    /// The stored SH degree of instances, of which one dispatch has several; `None`: a model without transform, of the
+    /// renderer's degree.
+    pub(super) instances: Option<u32>,
 }
 
 /// The gradients that the backward pass writes.
@@ -205,14 +209,15 @@ impl Projections {
         gpu: &Gpu,
         settings: &RenderSettings,
         [tile_width, tile_height]: [u32; 2],
-        ProjectionKind { camera_model, view_depths: has_depths }: ProjectionKind,
+        ProjectionKind { camera_model, view_depths: has_depths, instances }: ProjectionKind,
         WrittenGradients { kind, frozen_columns }: WrittenGradients,
     ) -> Result<Self> {
         let color_gradients = kind == GradientKind::Colors;
         let (view_depths, alpha_max) = (u32::from(has_depths), settings.max_alpha);
         let channels = settings.channels() as u32 + view_depths;
         let RenderSettings { raw_colors, antialiased, .. } = *settings;
-        let (sh_degree, lamp) = (settings.shape.sh_degree, settings.lamp.is_some());
+        let sh_degree = instances.unwrap_or(settings.shape.sh_degree);
+        let (lamp, is_instanced) = (settings.lamp.is_some(), instances.is_some());
         let half_rest = settings.rest == StorageFormat::Half;
         let rest_by_column = rest_by_column(gpu);
         macro_rules! pipeline {
@@ -233,13 +238,14 @@ impl Projections {
                 })?
             };
         }
-        let has_gradients = settings.purpose == Purpose::Train && !has_depths;
+        let has_gradients = settings.purpose == Purpose::Train && !has_depths && !is_instanced;
         let backward = if has_gradients {
             Some(pipeline!(project_backward, color_gradients, frozen_columns))
         } else {
             None
         };
-        Ok(Self { forward: pipeline!(project, view_depths), backward })
+        let instances = is_instanced;
+        Ok(Self { forward: pipeline!(project, view_depths, instances), backward })
     }
 }
 

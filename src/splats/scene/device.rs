@@ -1,6 +1,6 @@
 //! Gaussians on the device: their layout, and their owned and borrowed forms.
 
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 
 use super::{Gaussians, Shape, width};
 use crate::Result;
@@ -62,6 +62,31 @@ pub struct DeviceGaussians {
     pub parameters: Buffer<f32>,
     /// The world position that their positions are relative to.
     pub origin: DVec3,
+    /// As they were uploaded; `None` where they were not, or there is none.
+    #[doc(hidden)]
+    pub bounds: Option<Bounds>,
+}
+
+/// The extent of Gaussians.
+#[doc(hidden)]
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bounds {
+    /// Corners of the box of the means.
+    pub(crate) corners: [Vec3; 2],
+    /// The greatest standard deviation.
+    pub(crate) deviation: f32,
+}
+
+impl Bounds {
+    fn new(gaussians: &Gaussians) -> Option<Self> {
+        let first = *gaussians.means().first()?;
+        let corners = gaussians
+            .means()
+            .iter()
+            .fold([first; 2], |[least, most], &mean| [least.min(mean), most.max(mean)]);
+        let widest = gaussians.log_scales().iter().map(|scale| scale.max_element());
+        Some(Self { corners, deviation: widest.fold(f32::MIN, f32::max).exp() })
+    }
 }
 
 /// Gaussians on the device, borrowed for passes that read them.
@@ -86,7 +111,7 @@ impl DeviceGaussians {
         let len = layout.capacity.max(layout.count) * layout.words();
         let window = layout.parameter_batches(gpu).window();
         let parameters = gpu.uninit_in_windows("parameters", len, window)?;
-        Ok(Self { layout, parameters, origin: DVec3::ZERO })
+        Ok(Self { layout, parameters, origin: DVec3::ZERO, bounds: None })
     }
 
     /// Borrows them for rendering.
@@ -143,6 +168,7 @@ impl Gaussians {
         let mut gaussians =
             DeviceGaussians::uninit(gpu, Layout::new(self.count, self.shape, sh_rest))?;
         gaussians.origin = self.origin;
+        gaussians.bounds = Bounds::new(self);
         gaussians.write(gpu, &self.parameters)?;
         Ok(gaussians)
     }

@@ -275,7 +275,7 @@ static void renders(void)
     DRAW("layers", (other.layer = 1, drawn.color = &other));
     DRAW("layers", (other.layer = UINT32_MAX, drawn.color = &other));
     DRAW("unknown bits", drawn.flags = 1u << 31);
-    DRAW("reserved is 7", drawn.reserved = 7);
+    DRAW("pass one of them", drawn.instance_count = 7);
     DRAW("NspImage::struct_size", (other.struct_size = 0, drawn.color = &other));
     DRAW("is null", (other.image = VK_NULL_HANDLE, drawn.color = &other));
     DRAW("format", (other.format = VK_FORMAT_R8_UNORM, drawn.color = &other));

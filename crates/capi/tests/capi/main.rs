@@ -204,7 +204,8 @@ fn render(
         exposure: 0.0,
         background: [0.0; 3],
         budget: 0,
-        reserved: 0,
+        instance_count: 0,
+        instances: null(),
     }
 }
 
@@ -400,6 +401,36 @@ fn a_model_of_arrays_is_that_of_the_file_and_joined_models_are_sorted_together()
     ok(unsafe { nsp_model_join(device, models.as_ptr(), poses.as_ptr(), 2, &mut both) });
     // SAFETY: valid.
     assert_eq!(unsafe { nsp_model_count(both) }, 800);
+    // The same as instances, of one upload and in any frame anew.
+    let instances = poses.map(|pose| NspInstance {
+        struct_size: size_of::<NspInstance>(),
+        model: session.model,
+        pose,
+        scale: 0.0,
+        tint: [0.0; 4],
+        clip_min: [0.0; 3],
+        clip_max: [0.0; 3],
+        flags: 0,
+        reserved: 0,
+    });
+    let (camera, color) = (c_camera(), session.image());
+    let draw = |number, model: *const NspModel, instances: &[NspInstance]| {
+        let commands = session.host.begin();
+        let render = NspRender {
+            instance_count: instances.len() as u32,
+            instances: if instances.is_empty() { null() } else { instances.as_ptr() },
+            ..render(commands, number, &camera, &color)
+        };
+        // SAFETY: everything is valid, and the command buffer is recording.
+        ok(unsafe { nsp_record_render(session.renderer, model, &render) });
+        session.host.submit_frame(commands, number);
+        session.host.wait_frame(number);
+        session.pixels()
+    };
+    let joined = draw(3, both, &[]);
+    assert_close(&draw(4, null(), &instances), &joined);
+    let hidden = NspInstance { flags: NSP_INSTANCE_HIDDEN, ..instances[1] };
+    assert_eq!(draw(5, null(), &[instances[0], hidden]), draw(6, null(), &instances[..1]));
     let scaled = [rows(DAffine3::from_scale(DVec3::splat(2.0)))];
     let mut none = null_mut();
     // SAFETY: as above.

@@ -1,0 +1,289 @@
+//! Many models in one draw, each with a transform of its own, projected into one list and sorted together.
+
+use std::ops::Range;
+
+use glam::{DAffine3, DMat3, DVec3, Vec3};
+use nightsplat_core::camera::{Camera, CameraModel, deviation_from_rigid};
+
+use super::pipelines::ProjectionKind;
+use super::{KernelView, RenderSettings, Renderer, color_floats};
+use crate::gpu::{Kernel as _, Recorder, Threads};
+use crate::kernels::{self, InstanceView, project};
+use crate::splats::scene::{Bounds, DeviceGaussians, GaussianSlice, Layout};
+use crate::{Error, Result};
+
+/// A model in a draw, which may have others, and itself again elsewhere. The Gaussians are shared: nothing is copied.
+#[derive(Clone, Copy, Debug)]
+pub struct Instance<'a> {
+    /// Its Gaussians, of any SH degree; features, near plane and colours are those of the renderer's settings.
+    pub gaussians: &'a DeviceGaussians,
+    /// From the model's world, in which its positions are relative to the origin of the Gaussians, to the world of the
+    /// cameras: rigid.
+    pub pose: DAffine3,
+    /// The factor on lengths of the model before the pose.
+    pub scale: f64,
+    /// Factors of display-referred red, green and blue, 0 or more, and of the opacity, 0 to 1.
+    pub tint: [f32; 4],
+    /// The corners of a box in the model's world outside of which no Gaussian is seen, by its centre.
+    pub clip: Option<[DVec3; 2]>,
+    /// Whether it is drawn.
+    pub is_visible: bool,
+}
+
+impl<'a> Instance<'a> {
+    /// A model as it is.
+    pub fn new(gaussians: &'a DeviceGaussians) -> Self {
+        let tint = [1.0; 4];
+        let pose = DAffine3::IDENTITY;
+        Self { gaussians, pose, scale: 1.0, tint, clip: None, is_visible: true }
+    }
+
+    fn check(&self, index: usize, settings: &RenderSettings) -> Result<()> {
+        let refuse = |problem: String| Err(Error::Usage(format!("instance {index} {problem}")));
+        let layout = &self.gaussians.layout;
+        if layout.shape.features != settings.shape.features || layout.sh_rest != settings.rest {
+            return refuse(
+                "has other features or another format of SH coefficients than the renderer"
+                    .to_owned(),
+            );
+        }
+        if let Some(off) = deviation_from_rigid(&self.pose) {
+            return refuse(format!(
+                "has a pose that is not rigid, by {off:.4}; pass its scale as such"
+            ));
+        }
+        if !(self.scale.is_finite() && self.scale > 0.0) {
+            return refuse(format!("has scale {}; it is positive", self.scale));
+        }
+        let [red, green, blue, opacity] = self.tint;
+        let are_valid =
+            [red, green, blue].iter().all(|factor| factor.is_finite() && *factor >= 0.0);
+        if !(are_valid && (0.0..=1.0).contains(&opacity)) {
+            let tint = self.tint;
+            return refuse(format!("has tint {tint:?}; colours are 0 or more, the opacity 0 to 1"));
+        }
+        if self.clip.is_some_and(|[least, most]| least.is_nan() || most.is_nan()) {
+            return refuse("has a clip box with a NaN".to_owned());
+        }
+        Ok(())
+    }
+
+    /// From the coordinates of its means to those of a view.
+    fn view_from_model(&self, camera: &Camera) -> DAffine3 {
+        let scaled = DAffine3::from_scale(DVec3::splat(self.scale));
+        let origin = DAffine3::from_translation(self.gaussians.origin);
+        camera.view_from_world * self.pose * scaled * origin
+    }
+
+    /// As a camera sees it, with its splats from `first` on.
+    fn view(&self, camera: &Camera, first: u32) -> InstanceView {
+        let view = self.view_from_model(camera);
+        let DAffine3 { matrix3: DMat3 { x_axis, y_axis, z_axis }, translation } = view;
+        let center = view.matrix3.inverse() * -translation;
+        let origin = self.gaussians.origin;
+        let [least, most] = match self.clip {
+            Some(corners) => corners.map(|corner| (corner - origin).as_vec3()),
+            None => [Vec3::NEG_INFINITY, Vec3::INFINITY],
+        };
+        InstanceView {
+            view_from_model: [x_axis, y_axis, z_axis, translation]
+                .map(|column| column.as_vec3().to_array()),
+            camera_center: center.as_vec3(),
+            first,
+            tint: self.tint,
+            box_min: least,
+            box_max: most,
+        }
+    }
+
+    /// Whether a camera can see any of its splats: by the bounds that the Gaussians were uploaded with, and without any
+    /// always.
+    fn may_be_seen(&self, camera: &Camera, settings: &RenderSettings) -> bool {
+        self.gaussians.bounds.is_none_or(|bounds| {
+            bounds.may_be_seen(&self.view_from_model(camera), camera, settings)
+        })
+    }
+}
+
+/// A splat ends where its alpha is 1 / 255, at most this number of standard deviations from its centre.
+const DEVIATIONS: f64 = 3.34;
+
+impl Bounds {
+    /// What `project` computes, bounded: a splat is within `DEVIATIONS` of its standard deviation on the image, which
+    /// is no more than focal / depth sqrt(1 + slope^2) of that in the world, and the dilation.
+    fn may_be_seen(
+        &self,
+        view_from_model: &DAffine3,
+        camera: &Camera,
+        settings: &RenderSettings,
+    ) -> bool {
+        let [least, most] = self.corners.map(|corner| corner.as_dvec3());
+        let corner = |at: u32| {
+            let side = |axis: u32| at >> axis & 1 == 1;
+            let axes = [side(0), side(1), side(2)];
+            let pick = |k: usize| if axes[k] { most[k] } else { least[k] };
+            view_from_model.transform_point3(DVec3::new(pick(0), pick(1), pick(2)))
+        };
+        let corners: [DVec3; 8] = std::array::from_fn(|at| corner(at as u32));
+        if corners.iter().all(|corner| corner.z <= f64::from(settings.near)) {
+            return !matches!(camera.model, CameraModel::Pinhole);
+        }
+        if !matches!(camera.model, CameraModel::Pinhole) || !self.deviation.is_finite() {
+            return true;
+        }
+        let kernel = kernels::Camera::from(&camera.into());
+        let size = glam::DVec2::new(camera.width.into(), camera.height.into());
+        let scale = view_from_model.matrix3.x_axis.length();
+        let slopes = kernel.min_slope.abs().max(kernel.max_slope.abs()).as_dvec2();
+        let reach = DEVIATIONS
+            * scale
+            * f64::from(self.deviation)
+            * (DVec3::new(1.0, slopes.x, slopes.y).length() + 1.0);
+        let dilated = DEVIATIONS * kernels::splat::DILATION.sqrt() + 1.0;
+        (0..2).all(|axis| {
+            let slope = |pixel: f64| (pixel - camera.principal_point[axis]) / camera.focal[axis];
+            let (low, high) = (slope(-dilated), slope(size[axis] + dilated));
+            let is_right = |point: &DVec3| point[axis] - high * point.z <= reach;
+            let is_left = |point: &DVec3| low * point.z - point[axis] <= reach;
+            corners.iter().any(is_right) && corners.iter().any(is_left)
+        })
+    }
+}
+
+/// The splats of an instance: those of its Gaussians, and of whole workgroups, so that each model's can be bound.
+fn splats_of(layout: &Layout) -> usize {
+    layout.count.next_multiple_of(project::Kernel::INTERFACE.workgroup_size[0] as usize)
+}
+
+/// The Gaussians of one model, and its instances in the table.
+struct InstancedModel<'a> {
+    gaussians: GaussianSlice<'a>,
+    first_instance: u32,
+    instance_count: u32,
+    /// Of all its instances.
+    splats: Range<usize>,
+}
+
+/// The instances that a camera may see.
+pub(super) struct VisibleInstances<'a> {
+    models: Vec<InstancedModel<'a>>,
+    table: Vec<InstanceView>,
+    /// Splats of all of them.
+    pub(super) count: usize,
+}
+
+impl<'a> VisibleInstances<'a> {
+    pub(super) fn new(all: &[Instance<'a>], camera: &Camera, settings: &RenderSettings) -> Self {
+        let mut by_model: Vec<(GaussianSlice<'a>, Vec<&Instance<'a>>)> = vec![];
+        let is_drawn = |instance: &&Instance<'a>| {
+            instance.is_visible && instance.may_be_seen(camera, settings)
+        };
+        for instance in all.iter().filter(is_drawn) {
+            let slice = instance.gaussians.slice();
+            let known = by_model
+                .iter_mut()
+                .find(|(known, _)| known.parameters.begins_with(&slice.parameters));
+            match known {
+                Some((_, instances)) => instances.push(instance),
+                None => by_model.push((slice, vec![instance])),
+            }
+        }
+        let (mut models, mut table, mut count) = (vec![], vec![], 0);
+        for (gaussians, instances) in by_model {
+            let first_instance = table.len() as u32;
+            let instance_count = instances.len() as u32;
+            let each = splats_of(&gaussians.layout);
+            let views = instances.iter().zip((0..).step_by(each.max(1)));
+            table.extend(views.map(|(instance, first)| instance.view(camera, first)));
+            let splats = count..count + each * instances.len();
+            count = splats.end;
+            models.push(InstancedModel { gaussians, first_instance, instance_count, splats });
+        }
+        Self { models, table, count }
+    }
+}
+
+/// The splats of all instances together, as a renderer reserves memory for them.
+pub(super) fn layout_of(instances: &[Instance<'_>], settings: &RenderSettings) -> Result<Layout> {
+    let mut count = 0;
+    for (index, instance) in instances.iter().enumerate() {
+        instance.check(index, settings)?;
+        count += splats_of(&instance.gaussians.layout);
+    }
+    match u32::try_from(count) {
+        Ok(_) => Ok(Layout::new(count, settings.shape, settings.rest)),
+        Err(_) => Err(Error::Usage(format!("{count} splats of all instances exceed 32 bits"))),
+    }
+}
+
+impl Renderer {
+    /// Uploads the table of a view and records the projection of its instances.
+    pub(super) fn record_instances(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        visible: &VisibleInstances<'_>,
+        view: &KernelView<'_>,
+        sh_degree: u32,
+    ) -> Result<()> {
+        pass.update(&mut self.frame.instances, &visible.table)?;
+        let batches = |model: &InstancedModel<'_>| model.gaussians.layout.batches(&self.gpu);
+        // Each model writes splats of its own, unless it takes several passes.
+        let are_disjoint = visible.models.iter().all(|model| batches(model).iter().count() == 1);
+        let mut record = |pass: &mut Recorder<'_>| {
+            visible
+                .models
+                .iter()
+                .try_for_each(|model| self.record_model(pass, model, view, sh_degree))
+        };
+        if are_disjoint { pass.concurrently(record) } else { record(pass) }
+    }
+
+    /// Records the projection of the instances of a model.
+    fn record_model(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        model: &InstancedModel<'_>,
+        view: &KernelView<'_>,
+        sh_degree: u32,
+    ) -> Result<()> {
+        let Self { gpu, settings, projections, frame, lamp, .. } = self;
+        let InstancedModel { first_instance, instance_count, ref splats, .. } = *model;
+        let GaussianSlice { layout, parameters } = model.gaussians;
+        let stored = layout.shape.sh_degree;
+        let kind = ProjectionKind { instances: Some(stored), ..view.kind };
+        let floats = color_floats(view.channels);
+        for batch in layout.batches(gpu).iter() {
+            let gaussian_count = batch.gaussian_count();
+            let groups = gaussian_count.div_ceil(project::Kernel::INTERFACE.workgroup_size[0]);
+            pass.dispatch(
+                &projections[&kind].forward,
+                &project::Params {
+                    camera_index: view.camera_index,
+                    near: settings.near,
+                    gaussian_count,
+                    sh_degree: sh_degree.min(stored),
+                    first_gaussian: batch.first_gaussian(),
+                    first_instance,
+                    instance_count,
+                    first_splat: splats.start as u32,
+                },
+                project::Buffers {
+                    parameters: batch.rows(parameters, layout.words())?,
+                    splats: frame.splats.slice_mut().range(splats.clone())?,
+                    colors: frame
+                        .colors
+                        .slice_mut()
+                        .range(floats * splats.start..floats * splats.end)?,
+                    depth_keys: frame.depth_keys.slice_mut().range(splats.clone())?,
+                    ids: frame.ids.slice_mut().range(splats.clone())?,
+                    tile_counts: frame.tile_counts.slice_mut().range(splats.clone())?,
+                    cameras: view.cameras.unwrap_or(&frame.camera).slice(),
+                    lamp: super::lamp::bound(lamp.as_ref(), parameters)?,
+                    instances: frame.instances.slice(),
+                },
+                Threads::Workgroups([groups * instance_count, 1, 1]),
+            )?;
+        }
+        Ok(())
+    }
+}
