@@ -116,6 +116,13 @@ impl Host {
         lock(&self.uploads).push(upload);
     }
 
+    /// Puts uploads before those that wait.
+    fn requeue(&self, mut first: Vec<Upload>) {
+        let mut waiting = lock(&self.uploads);
+        first.append(&mut waiting);
+        *waiting = first;
+    }
+
     /// Forgets the uploads into a buffer that is dropped.
     pub(super) fn forget(&self, target: vk::Buffer) {
         let is_into = |upload: &mut Upload| upload.target() == target;
@@ -164,19 +171,20 @@ impl GpuShared {
         if let Some(mapped) = has_run.mapped_mut() {
             mapped.fill(0);
         }
-        let mut uploads = std::mem::take(&mut *lock(&host.uploads));
+        let uploads = std::mem::take(&mut *lock(&host.uploads));
         uploads.iter().for_each(|upload| upload.record(recorder));
+        let (mark, frame) = (has_run.bound(), self.last_frame());
+        // In the list while `record` runs, which may drop a buffer.
+        lock(&host.recorded).push(RecordedUploads { frame, uploads, has_run });
         let done = record(recorder);
         if done.is_ok() {
-            recorder.fill_raw(has_run.bound(), 1);
+            recorder.fill_raw(mark, 1);
             recorder.leave_for_host();
-            let frame = self.last_frame();
-            lock(&host.recorded).push(RecordedUploads { frame, uploads, has_run });
-        } else {
-            let mut waiting = lock(&host.uploads);
-            uploads.append(&mut waiting);
-            *waiting = uploads;
+            return done;
         }
+        let is_this = |them: &mut RecordedUploads| them.has_run.handle() == mark.raw;
+        let failed: Vec<_> = lock(&host.recorded).extract_if(.., is_this).collect();
+        host.requeue(failed.into_iter().flat_map(|them| them.uploads).collect());
         done
     }
 
@@ -194,9 +202,7 @@ impl GpuShared {
                 dropped.append(&mut them.uploads);
             }
         }
-        let mut waiting = lock(&host.uploads);
-        dropped.append(&mut waiting);
-        *waiting = dropped;
+        host.requeue(dropped);
     }
 }
 

@@ -155,11 +155,12 @@ impl Target<'_> {
         check_image("depth", self.depth, &[ImageFormat::R32Float], cameras)?;
         let Some(scene) = &self.scene else { return Ok(()) };
         check_image("scene depth", Some(scene.image), SCENE_FORMATS, cameras)?;
-        if [self.color, self.depth].iter().flatten().any(|image| image.handle == scene.image.handle)
-        {
-            return refused("the scene depth is one of the images that are written".to_owned());
+        scene.check()?;
+        let mut written = [self.color, self.depth].into_iter().flatten();
+        match written.any(|image| image.handle == scene.image.handle) {
+            true => refused("the scene depth is one of the images that are written".to_owned()),
+            false => Ok(()),
         }
-        scene.check()
     }
 }
 
