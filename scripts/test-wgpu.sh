@@ -1,0 +1,31 @@
+#!/usr/bin/env bash
+# Builds examples/wgpu, and has wgpu's own device draw a model under the validation layer: without a message, and the
+# library's own picture to a level.
+set -euo pipefail
+cd "$(dirname "$0")/../examples/wgpu"
+
+export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$PWD/../../target}
+cargo clippy --locked --all-targets -- -D warnings
+cargo build --locked
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+# Some hundred Gaussians around the origin.
+awk 'BEGIN {
+    count = 300; srand(7)
+    print "ply\nformat ascii 1.0\nelement vertex " count
+    split("x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3", names, " ")
+    for (k = 1; k <= 14; k++) print "property float " names[k]
+    print "end_header"
+    for (i = 0; i < count; i++) {
+        for (k = 1; k <= 14; k++) printf "%.4f ", (k <= 3 ? 2 * rand() - 1 : k <= 6 ? 2 * rand() - 0.5 : k == 7 ? rand() : k <= 10 ? -3 + rand() : 0.1 + rand())
+        print ""
+    }
+}' > "$folder/model.ply"
+export VK_INSTANCE_LAYERS=VK_LAYER_KHRONOS_validation
+export VK_LAYER_ENABLES=VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT
+for wall in "" 4; do
+    printed=$("$CARGO_TARGET_DIR/debug/wgpu-host" "$folder/model.ply" "$folder/out.ppm" $wall 2>&1) || { echo "$printed"; exit 1; }
+    echo "wall ${wall:-none}: $printed"
+    ! grep -q 'Validation\|VUID' <<< "$printed" || { echo "a message of the validation layer" >&2; exit 1; }
+    grep -q '^largest difference [01]$' <<< "$printed" || { echo "another picture" >&2; exit 1; }
+done
