@@ -6,7 +6,7 @@ use crate::kernels::half::{LARGEST_HALF, SMALLEST_HALF};
 use crate::splats::attributes::PlaneCounts;
 
 /// Storage format of trained numbers; arithmetic is in 32 bits.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum StorageFormat {
     /// 32-bit float.
     #[default]

@@ -8,6 +8,8 @@ use crate::Error;
 pub(super) const MAX_STEPS: u64 = 64;
 /// The target time of a submission.
 const SUBMISSION: Duration = Duration::from_millis(50);
+/// The time of a call that trains.
+pub(super) const CALL: Duration = Duration::from_millis(500);
 /// The most submissions in flight: one runs, one waits.
 const IN_FLIGHT: usize = 2;
 /// The passes of slower steps are submitted one by one: Windows resets a device after two seconds of one submission.
@@ -20,6 +22,8 @@ pub(super) struct StepBatching {
     /// A fixed number of steps, for tests.
     steps: Option<u64>,
     pub(super) step: Duration,
+    /// The time of a call, after which nothing more is submitted.
+    pub(super) budget: Duration,
     /// The time of a step from which on its passes are submitted one by one.
     pub(super) slow_step: Duration,
     last_done: Instant,
@@ -31,6 +35,7 @@ impl Default for StepBatching {
             in_flight: IN_FLIGHT,
             steps: None,
             step: SUBMISSION,
+            budget: CALL,
             slow_step: SLOW_STEP,
             last_done: Instant::now(),
         }
@@ -43,9 +48,10 @@ impl StepBatching {
         Self { in_flight: in_flight.max(1), steps, ..Self::default() }
     }
 
-    /// The steps of the next submission.
+    /// The steps of the next submission: a quarter of the budget at most, as two of them may be in flight.
     pub(super) fn steps(&self) -> u64 {
-        let fitting = SUBMISSION.as_secs_f64() / self.step.as_secs_f64().max(1e-6);
+        let target = SUBMISSION.min(self.budget / 4);
+        let fitting = target.as_secs_f64() / self.step.as_secs_f64().max(1e-6);
         self.steps.unwrap_or(fitting as u64).clamp(1, MAX_STEPS)
     }
 

@@ -40,7 +40,9 @@ impl TrainedGaussians {
     ) -> Result<Self> {
         let sh_degree = gaussians.shape.sh_degree;
         let gaussians = gaussians.with_sh_degree(in_use.max(gaussians.sh_degree_in_use()));
-        let gaussians = gaussians.upload_as(gpu, precision.rest)?;
+        let mut gaussians = gaussians.upload_as(gpu, precision.rest)?;
+        // They move.
+        gaussians.bounds = None;
         let count = gaussians.layout.count;
         let batches = gaussians.layout.batches(gpu).without(frozen_columns);
         Ok(Self {

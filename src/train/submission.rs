@@ -19,8 +19,6 @@ use crate::loss::{LossLogDownload, StepLosses};
 use crate::splats::render::Status;
 use crate::{Error, Result};
 
-/// The interval of reports.
-const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 /// The interval of checks for NaN, which read a hundredth of what Adam reads.
 const FINITE_STEPS: u64 = 50;
 
@@ -85,7 +83,10 @@ impl Trainer {
                 && in_flight.len() < self.clock.submissions.batching.in_flight
             {
                 let has_news = !(reports.is_empty() && in_flight.is_empty());
-                if has_news && begin.elapsed() > REPORT_INTERVAL {
+                let batching = &self.clock.submissions.batching;
+                // What is in flight and what would be sent are to end within the budget.
+                let ahead = batching.step * (in_flight.len() as u32 + 1) * batching.steps() as u32;
+                if has_news && begin.elapsed() + ahead > batching.budget {
                     break;
                 }
                 let steps = next..=last.min(next + self.clock.submissions.batching.steps() - 1);

@@ -1,12 +1,15 @@
 //! A model in training: each step renders one view and compares it with its pseudo-GT.
 
 use std::sync::Arc;
+use std::time::Duration;
 
+use glam::DAffine3;
 use nightsplat_core::camera::{Camera, TrainingFrame};
 use nightsplat_photographs::dataset::{Dataset, Fingerprint};
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::SceneLaw;
 
+use super::batching::CALL;
 use super::clock::RunClock;
 use super::config::TrainConfig;
 use super::context::Initial;
@@ -21,7 +24,7 @@ use crate::loss::Term;
 use crate::loss::exposure::Affine;
 use crate::splats::lamp::Lamp;
 use crate::splats::optimizer::{AdamStep, GaussianStep, LearningRates};
-use crate::splats::render::{Damping, Gradients, RenderOptions};
+use crate::splats::render::{Damping, Gradients, Instance, Purpose, RenderOptions, RenderSettings};
 use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::{Error, Result, splats};
 
@@ -236,6 +239,44 @@ impl Trainer {
             Some(checked) if checked > step + 1 => self.submit_steps(checked - 1),
             Some(_) if step < until.min(self.last_step()) => self.agreeing_step(),
             _ => self.submit_steps(until),
+        }
+    }
+
+    /// [`Trainer::advance`] for about `budget` instead of half a second. A call takes a step at the least; density control
+    /// and the scores of held-out views, where they are due, come on top.
+    ///
+    /// # Errors
+    /// Those of [`Trainer::advance`].
+    pub fn advance_within(&mut self, until: u64, budget: Duration) -> Result<Vec<StepReport>> {
+        self.clock.submissions.batching.budget = budget;
+        let reports = self.advance(until);
+        self.clock.submissions.batching.budget = CALL;
+        reports
+    }
+
+    /// The Gaussians as they are now, in the dataset's world, to draw without a copy. The next call that trains changes
+    /// them, so what draws them is recorded and submitted before it, on the trainer's queue.
+    pub fn live(&self) -> Instance<'_> {
+        let TrainingFrame { center, scale } = self.scene.frame;
+        let pose = DAffine3::from_translation(center.into());
+        Instance { pose, scale: 1.0 / scale, ..Instance::new(&self.model.gaussians.values) }
+    }
+
+    /// The settings of a renderer that draws [`Trainer::live`].
+    pub fn live_settings(&self) -> RenderSettings {
+        let shown = Gaussians::zeros(0, self.model.gaussians.shape());
+        let RenderSettings { near, max_alpha, raw_colors, antialiased, law, .. } =
+            self.model_of(&shown).render_settings();
+        let shape = self.model.gaussians.shape();
+        RenderSettings {
+            near,
+            max_alpha,
+            raw_colors,
+            antialiased,
+            law,
+            shape,
+            purpose: Purpose::Show,
+            ..RenderSettings::default()
         }
     }
 

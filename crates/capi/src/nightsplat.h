@@ -239,8 +239,11 @@ typedef struct NspImage {
 typedef struct NspInstance {
     // `sizeof(NspInstance)`; in an array, the distance between elements.
     size_t struct_size;
-    // The model.
+    // The model; NULL with a trainer.
     const struct NspModel *model;
+    // A trainer whose Gaussians are drawn as they are, without a copy: the recording is submitted before the next call of
+    // `nsp_trainer_advance`, to the same queue. NULL: a model.
+    const struct NspTrainer *trainer;
     // The rigid transform from the model's world to that of the cameras, three rows of four; all zeros: none.
     double pose[12];
     // The factor on lengths of the model, before the pose; 0 stands for 1.
@@ -476,12 +479,20 @@ NspResult nsp_trainer_create(struct NspDevice *device,
                              const char *config_toml,
                              struct NspTrainer **trainer);
 
-// Trains for about half a second, up to step `until` at most. Writes the last of these steps to `steps`, at most
-// `*count`, and their number to `*count`; both may be NULL. No step: `until` is reached, or the training has ended.
-NspResult nsp_trainer_advance(struct NspTrainer *trainer, uint64_t until, struct NspStep *steps, uint32_t *count);
+// Trains for about `milliseconds`, up to step `until` at most; 0 stands for 500. Density control and the scores of
+// held-out views, where they are due, come on top. Writes the last of these steps to `steps`, at most `*count`, and
+// their number to `*count`; both may be NULL. No step: `until` is reached, or the training has ended.
+NspResult nsp_trainer_advance(struct NspTrainer *trainer,
+                              uint64_t until,
+                              uint32_t milliseconds,
+                              struct NspStep *steps,
+                              uint32_t *count);
 
 // Copies the current model, on the trainer's device.
 NspResult nsp_trainer_model(struct NspTrainer *trainer, struct NspModel **model);
+
+// Writes a checkpoint of the training, from which `nightsplat train --resume` goes on, if a run directory has it.
+NspResult nsp_trainer_checkpoint(struct NspTrainer *trainer, const char *path);
 
 // Saves the current model in the format of the path's extension: `.ply`, `.spz`, `.sog` or `.glb`.
 NspResult nsp_trainer_save(struct NspTrainer *trainer, const char *path);

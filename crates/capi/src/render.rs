@@ -21,6 +21,7 @@ use super::device::{NspDevice, VkCommandBuffer};
 use super::error::{Failure, NspResult, Object, guard};
 use super::model::{LoadedModel, NspModel};
 use super::structs::{Sized0, destroy, give, object, object_mut, read, read_all, write};
+use super::train::{NspTrainer, live};
 
 /// A renderer: compiled kernels, and memory that grows with the views. Use it from one thread at a time.
 #[derive(Debug)]
@@ -118,8 +119,11 @@ pub const NSP_INSTANCE_CLIP: u32 = 2;
 pub struct NspInstance {
     /// `sizeof(NspInstance)`; in an array, the distance between elements.
     pub struct_size: usize,
-    /// The model.
+    /// The model; NULL with a trainer.
     pub model: *const NspModel,
+    /// A trainer whose Gaussians are drawn as they are, without a copy: the recording is submitted before the next call of
+    /// `nsp_trainer_advance`, to the same queue. NULL: a model.
+    pub trainer: *const NspTrainer,
     /// The rigid transform from the model's world to that of the cameras, three rows of four; all zeros: none.
     pub pose: [f64; 12],
     /// The factor on lengths of the model, before the pose; 0 stands for 1.
@@ -431,22 +435,33 @@ unsafe fn lent_instance<'a>(
         return Err(Failure::usage(text));
     }
     // SAFETY: as the caller promises.
-    let model = unsafe { object(instance.model, &format!("the model of instance {at}")) }?;
-    let LoadedModel { model, on_device } = model.0.get("a model")?;
-    check_device(&shown.gpu, on_device)?;
-    if appearance(model) != shown.appearance {
-        return Err(Failure::usage(format!(
-            "the model of instance {at} has other colours, alpha limit or antialiasing than that of the renderer"
-        )));
-    }
+    let whole = match unsafe { instance.trainer.as_ref() } {
+        Some(trainer) => live(trainer)?,
+        None => {
+            // SAFETY: as the caller promises.
+            let model = unsafe { object(instance.model, &format!("the model of instance {at}")) }?;
+            let LoadedModel { model, on_device } = model.0.get("a model")?;
+            if appearance(model) != shown.appearance {
+                return Err(Failure::usage(format!(
+                    "the model of instance {at} has other colours, alpha limit or antialiasing than that of the renderer"
+                )));
+            }
+            Instance::new(on_device)
+        }
+    };
+    check_device(&shown.gpu, whole.gaussians)?;
     let corners = [instance.clip_min, instance.clip_max].map(DVec3::from);
+    let pose = if instance.pose == [0.0; 12] { DAffine3::IDENTITY } else { affine(&instance.pose) };
+    let scale = if instance.scale == 0.0 { 1.0 } else { instance.scale };
+    // That of a trainer takes its frame to the world first.
+    let offset = DAffine3::from_translation(scale * whole.pose.translation);
     Ok(Instance {
-        pose: if instance.pose == [0.0; 12] { DAffine3::IDENTITY } else { affine(&instance.pose) },
-        scale: if instance.scale == 0.0 { 1.0 } else { instance.scale },
+        pose: pose * offset,
+        scale: scale * whole.scale,
         tint: if instance.tint == [0.0; 4] { [1.0; 4] } else { instance.tint },
         clip: (instance.flags & NSP_INSTANCE_CLIP != 0).then_some(corners),
         is_visible: instance.flags & NSP_INSTANCE_HIDDEN == 0,
-        ..Instance::new(on_device)
+        ..whole
     })
 }
 

@@ -12,7 +12,8 @@ use super::device::NspDevice;
 use super::error::{NspResult, guard};
 use super::model::NspModel;
 use super::structs::{Sized0, destroy, give, object_mut};
-use training::{Training, advance, begin, current, save};
+pub(super) use training::live;
+use training::{Training, advance, begin, checkpoint, current, save};
 
 /// A training run. Use it from one thread at a time.
 #[derive(Debug)]
@@ -58,8 +59,9 @@ pub unsafe extern "C" fn nsp_trainer_create(
     })
 }
 
-/// Trains for about half a second, up to step `until` at most. Writes the last of these steps to `steps`, at most
-/// `*count`, and their number to `*count`; both may be NULL. No step: `until` is reached, or the training has ended.
+/// Trains for about `milliseconds`, up to step `until` at most; 0 stands for 500. Density control and the scores of
+/// held-out views, where they are due, come on top. Writes the last of these steps to `steps`, at most `*count`, and
+/// their number to `*count`; both may be NULL. No step: `until` is reached, or the training has ended.
 ///
 /// # Safety
 /// `trainer` is NULL or valid; `steps` holds `*count`.
@@ -67,12 +69,13 @@ pub unsafe extern "C" fn nsp_trainer_create(
 pub unsafe extern "C" fn nsp_trainer_advance(
     trainer: *mut NspTrainer,
     until: u64,
+    milliseconds: u32,
     steps: *mut NspStep,
     count: *mut u32,
 ) -> NspResult {
     guard("nsp_trainer_advance", || {
         // SAFETY: as the caller promises.
-        unsafe { advance(object_mut(trainer, "trainer")?, until, steps, count) }
+        unsafe { advance(object_mut(trainer, "trainer")?, until, milliseconds, steps, count) }
     })
 }
 
@@ -88,6 +91,21 @@ pub unsafe extern "C" fn nsp_trainer_model(
     guard("nsp_trainer_model", || {
         // SAFETY: as the caller promises.
         unsafe { give(model, "model", || current(object_mut(trainer, "trainer")?)) }
+    })
+}
+
+/// Writes a checkpoint of the training, from which `nightsplat train --resume` goes on, if a run directory has it.
+///
+/// # Safety
+/// `trainer` is NULL or valid; `path` is NULL or ends with NUL.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nsp_trainer_checkpoint(
+    trainer: *mut NspTrainer,
+    path: *const c_char,
+) -> NspResult {
+    guard("nsp_trainer_checkpoint", || {
+        // SAFETY: as the caller promises.
+        unsafe { checkpoint(object_mut(trainer, "trainer")?, path) }
     })
 }
 

@@ -5,7 +5,7 @@
 
 use nightsplat_core::camera::{Camera, Patch};
 
-use super::instances::{Instance, VisibleInstances, layout_of};
+use super::instances::{Instance, VisibleInstances, layout_of, stored};
 use super::target::Target;
 use super::{DepthChannel, ProjectionKind, RenderOptions, Renderer};
 use crate::Result;
@@ -217,7 +217,7 @@ impl Renderer {
         for camera in cameras {
             let camera_model = model_number(&camera.model);
             for instance in instances {
-                let instances = Some(instance.gaussians.layout.shape.sh_degree);
+                let instances = Some(stored(&instance.gaussians.layout));
                 self.build_projections(ProjectionKind { camera_model, view_depths, instances })?;
             }
         }

@@ -9,6 +9,7 @@ use super::pipelines::ProjectionKind;
 use super::{KernelView, RenderSettings, Renderer, color_floats};
 use crate::gpu::{Kernel as _, Recorder, Threads};
 use crate::kernels::{self, InstanceView, project};
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{Bounds, DeviceGaussians, GaussianSlice, Layout};
 use crate::{Error, Result};
 
@@ -41,11 +42,8 @@ impl<'a> Instance<'a> {
     fn check(&self, index: usize, settings: &RenderSettings) -> Result<()> {
         let refuse = |problem: String| Err(Error::Usage(format!("instance {index} {problem}")));
         let layout = &self.gaussians.layout;
-        if layout.shape.features != settings.shape.features || layout.sh_rest != settings.rest {
-            return refuse(
-                "has other features or another format of SH coefficients than the renderer"
-                    .to_owned(),
-            );
+        if layout.shape.features != settings.shape.features {
+            return refuse("has other features than the renderer".to_owned());
         }
         if let Some(off) = deviation_from_rigid(&self.pose) {
             return refuse(format!(
@@ -150,6 +148,11 @@ impl Bounds {
     }
 }
 
+/// The SH degree that is stored, and how.
+pub(super) fn stored(layout: &Layout) -> (u32, StorageFormat) {
+    (layout.shape.sh_degree, layout.sh_rest)
+}
+
 /// The splats of an instance: those of its Gaussians, and of whole workgroups, so that each model's can be bound.
 fn splats_of(layout: &Layout) -> usize {
     layout.count.next_multiple_of(project::Kernel::INTERFACE.workgroup_size[0] as usize)
@@ -249,8 +252,7 @@ impl Renderer {
         let Self { gpu, settings, projections, frame, lamp, .. } = self;
         let InstancedModel { first_instance, instance_count, ref splats, .. } = *model;
         let GaussianSlice { layout, parameters } = model.gaussians;
-        let stored = layout.shape.sh_degree;
-        let kind = ProjectionKind { instances: Some(stored), ..view.kind };
+        let kind = ProjectionKind { instances: Some(stored(&layout)), ..view.kind };
         let floats = color_floats(view.channels);
         for batch in layout.batches(gpu).iter() {
             let gaussian_count = batch.gaussian_count();
@@ -261,7 +263,7 @@ impl Renderer {
                     camera_index: view.camera_index,
                     near: settings.near,
                     gaussian_count,
-                    sh_degree: sh_degree.min(stored),
+                    sh_degree: sh_degree.min(layout.shape.sh_degree),
                     first_gaussian: batch.first_gaussian(),
                     first_instance,
                     instance_count,

@@ -183,9 +183,9 @@ pub(super) struct ProjectionKind {
     pub(super) camera_model: u32,
     /// Whether the last channel is the depth in the view.
     pub(super) view_depths: bool,
-    /// The stored SH degree of instances, of which one dispatch has several; `None`: a model without transform, of the
-    /// renderer's degree.
-    pub(super) instances: Option<u32>,
+    /// The stored SH degree of instances and its format; one dispatch has several of them. `None`: a model without
+    /// transform, as the renderer's settings say.
+    pub(super) instances: Option<(u32, StorageFormat)>,
 }
 
 /// The gradients that the backward pass writes.
@@ -216,9 +216,9 @@ impl Projections {
         let (view_depths, alpha_max) = (u32::from(has_depths), settings.max_alpha);
         let channels = settings.channels() as u32 + view_depths;
         let RenderSettings { raw_colors, antialiased, .. } = *settings;
-        let sh_degree = instances.unwrap_or(settings.shape.sh_degree);
+        let (sh_degree, rest) = instances.unwrap_or((settings.shape.sh_degree, settings.rest));
         let (lamp, is_instanced) = (settings.lamp.is_some(), instances.is_some());
-        let half_rest = settings.rest == StorageFormat::Half;
+        let half_rest = rest == StorageFormat::Half;
         let rest_by_column = rest_by_column(gpu);
         macro_rules! pipeline {
             ($kernel:ident $(, $extra:ident)*) => {

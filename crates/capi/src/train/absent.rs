@@ -2,6 +2,8 @@
 
 use std::ffi::c_char;
 
+use nightsplat::Instance;
+
 use super::{NspStep, NspTrainer};
 use crate::device::NspDevice;
 use crate::error::{Failure, NSP_ERROR_UNSUPPORTED};
@@ -26,9 +28,18 @@ pub(super) fn begin(
 pub(super) fn advance(
     _: &mut NspTrainer,
     _: u64,
+    _: u32,
     _: *mut NspStep,
     _: *mut u32,
 ) -> Result<(), Failure> {
+    unsupported()
+}
+
+pub(super) fn checkpoint(_: &mut NspTrainer, _: *const c_char) -> Result<(), Failure> {
+    unsupported()
+}
+
+pub(crate) fn live(_: &NspTrainer) -> Result<Instance<'_>, Failure> {
     unsupported()
 }
 

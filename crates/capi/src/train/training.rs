@@ -1,7 +1,9 @@
 //! What the functions do that train.
 
 use std::ffi::c_char;
+use std::time::Duration;
 
+use nightsplat::Instance;
 use nightsplat::gpu::Gpu;
 use nightsplat::train::Trainer;
 
@@ -46,11 +48,15 @@ pub(super) unsafe fn begin(
 pub(super) unsafe fn advance(
     trainer: &mut NspTrainer,
     until: u64,
+    milliseconds: u32,
     steps: *mut NspStep,
     count: *mut u32,
 ) -> Result<(), Failure> {
     trainer.0.with("the trainer", |TrainerOnDevice { trainer, .. }| {
-        let reports = if trainer.has_ended() { vec![] } else { trainer.advance(until)? };
+        let milliseconds = if milliseconds == 0 { 500 } else { milliseconds };
+        let budget = Duration::from_millis(milliseconds.into());
+        let ended = trainer.has_ended();
+        let reports = if ended { vec![] } else { trainer.advance_within(until, budget)? };
         let gaussians = trainer.gaussian_count() as u32;
         // SAFETY: as the caller promises.
         let Some(count) = (unsafe { count.as_mut() }) else { return Ok(()) };
@@ -66,6 +72,24 @@ pub(super) unsafe fn advance(
         *count = taken as u32;
         Ok(())
     })
+}
+
+/// # Safety
+/// As [`nsp_trainer_checkpoint`](super::nsp_trainer_checkpoint).
+pub(super) unsafe fn checkpoint(
+    trainer: &mut NspTrainer,
+    path: *const c_char,
+) -> Result<(), Failure> {
+    // SAFETY: as the caller promises.
+    let path = unsafe { text(path, "path")? };
+    trainer.0.with("the trainer", |TrainerOnDevice { trainer, .. }| {
+        Ok(trainer.save_checkpoint(path.as_ref())?)
+    })
+}
+
+/// The Gaussians as they are now.
+pub(crate) fn live(trainer: &NspTrainer) -> Result<Instance<'_>, Failure> {
+    Ok(trainer.0.get("the trainer")?.trainer.live())
 }
 
 pub(super) fn current(trainer: &mut NspTrainer) -> Result<NspModel, Failure> {

@@ -251,7 +251,7 @@ fn every_member_is_where_c_has_it() {
             struct_size, commands, frame, cameras, camera_count, flags, color, depth_out, scene_depth, scene_near,
             scene_far, exposure, background, budget, instance_count, instances,
         }
-        NspInstance { struct_size, model, pose, scale, tint, clip_min, clip_max, flags, reserved }
+        NspInstance { struct_size, model, trainer, pose, scale, tint, clip_min, clip_max, flags, reserved }
         NspStatus { struct_size, frame, intersections, capacity, left_out, splats_per_tile, device_bytes }
         NspStep { struct_size, step, loss, gaussians, reserved }
     };

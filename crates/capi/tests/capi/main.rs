@@ -209,6 +209,22 @@ fn render(
     }
 }
 
+/// A model as it is.
+fn whole(model: *const NspModel) -> NspInstance {
+    NspInstance {
+        struct_size: size_of::<NspInstance>(),
+        model,
+        trainer: null(),
+        pose: [0.0; 12],
+        scale: 0.0,
+        tint: [0.0; 4],
+        clip_min: [0.0; 3],
+        clip_max: [0.0; 3],
+        flags: 0,
+        reserved: 0,
+    }
+}
+
 /// A host with its device lent, and a model and a renderer on it.
 struct Session {
     host: Host,
@@ -402,17 +418,7 @@ fn a_model_of_arrays_is_that_of_the_file_and_joined_models_are_sorted_together()
     // SAFETY: valid.
     assert_eq!(unsafe { nsp_model_count(both) }, 800);
     // The same as instances, of one upload and in any frame anew.
-    let instances = poses.map(|pose| NspInstance {
-        struct_size: size_of::<NspInstance>(),
-        model: session.model,
-        pose,
-        scale: 0.0,
-        tint: [0.0; 4],
-        clip_min: [0.0; 3],
-        clip_max: [0.0; 3],
-        flags: 0,
-        reserved: 0,
-    });
+    let instances = poses.map(|pose| NspInstance { pose, ..whole(session.model) });
     let (camera, color) = (c_camera(), session.image());
     let draw = |number, model: *const NspModel, instances: &[NspInstance]| {
         let commands = session.host.begin();

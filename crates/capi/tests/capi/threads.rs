@@ -64,7 +64,7 @@ fn a_trainer_and_its_host_submit_from_two_threads_under_the_hosts_lock() {
             );
             while last < 40 {
                 let mut count = 64;
-                ok(nsp_trainer_advance(trainer, 40, steps.as_mut_ptr(), &mut count));
+                ok(nsp_trainer_advance(trainer, 40, 20, steps.as_mut_ptr(), &mut count));
                 assert!(count > 0, "the training ended at step {last}");
                 last = steps[count as usize - 1].step;
                 assert!(steps[..count as usize].iter().all(|step| step.loss.is_finite()));
@@ -72,7 +72,39 @@ fn a_trainer_and_its_host_submit_from_two_threads_under_the_hosts_lock() {
             let mut model = null_mut();
             ok(nsp_trainer_model(trainer, &mut model));
             assert!(nsp_model_count(model) > 0);
+            // The trainer's Gaussians as they are, and the copy.
+            let mut renderer = null_mut();
+            ok(nsp_renderer_create(device, model, &mut renderer));
+            let (camera, color) = (c_camera(), session.image());
+            let live = NspInstance { trainer, ..whole(null()) };
+            let pictures = [(model.cast_const(), null(), 0), (null(), &raw const live, 1)].map(
+                |(model, instances, instance_count)| {
+                    let number = 1 + u64::from(instance_count);
+                    let commands = session.host.begin();
+                    let drawn = NspRender {
+                        instances,
+                        instance_count,
+                        ..render(commands, number, &camera, &color)
+                    };
+                    ok(nsp_record_render(renderer, model, &drawn));
+                    lock_queue(null_mut(), session.host.queue);
+                    session.host.submit_frame(commands, number);
+                    unlock_queue(null_mut(), session.host.queue);
+                    session.host.wait_frame(number);
+                    lock_queue(null_mut(), session.host.queue);
+                    let pixels = session.pixels();
+                    unlock_queue(null_mut(), session.host.queue);
+                    pixels
+                },
+            );
+            let off = pictures[0].iter().zip(&pictures[1]).map(|(a, b)| a.abs_diff(*b)).max();
+            assert!(off <= Some(2), "{off:?} levels");
+            assert!(pictures[1].iter().any(|byte| *byte > 20), "nothing is seen");
+            nsp_renderer_destroy(renderer);
             nsp_model_destroy(model);
+            let checkpoint = c_path(&session.folder.path().join("checkpoint.safetensors"));
+            ok(nsp_trainer_checkpoint(trainer, checkpoint.as_ptr()));
+            assert!(session.folder.path().join("checkpoint.safetensors").exists());
             let saved = c_path(&session.folder.path().join("trained.spz"));
             ok(nsp_trainer_save(trainer, saved.as_ptr()));
             nsp_trainer_destroy(trainer);
