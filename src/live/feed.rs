@@ -25,6 +25,10 @@ const SNAPSHOT_EVERY: Duration = Duration::from_secs(1);
 const SNAPSHOT_SHARE: f64 = 0.04;
 /// Progress is read from files at most this often, however many pages ask.
 const STATE_EVERY: Duration = Duration::from_millis(250);
+/// A page that has not asked for so long is closed, or hidden.
+const WATCHED_WITHIN: Duration = Duration::from_millis(2500);
+/// The time that an answer takes to its page.
+const ANSWERED_WITHIN: Duration = Duration::from_millis(100);
 
 /// What is shown.
 #[derive(Debug)]
@@ -58,8 +62,12 @@ struct FeedState {
     fingerprint: Option<String>,
     /// Why the newest model cannot be shown, on one line.
     problem: Option<String>,
+    /// How the training in this process ended, and whether a page knows.
+    ended: Option<(String, bool)>,
     /// When the next snapshot may be requested.
     next: Option<Instant>,
+    /// When a page last asked.
+    asked: Option<Instant>,
     /// The last answer.
     told: Option<(Instant, Value)>,
 }
@@ -88,6 +96,33 @@ impl Feed {
         Self { requests: None, state: Mutex::new(state) }
     }
 
+    /// Whether the model never changes.
+    pub(crate) fn is_fixed(&self) -> bool {
+        matches!(self.lock().source, FeedSource::Fixed)
+    }
+
+    /// Takes how the training in this process ended, on one line, and waits until a page that is open has asked for it.
+    pub(crate) fn end(&self, ended: &str) {
+        let (is_watched, begin) = {
+            let mut state = self.lock();
+            state.told = None;
+            state.ended = Some((ended.to_owned(), false));
+            (state.asked.is_some_and(|at| at.elapsed() < WATCHED_WITHIN), Instant::now())
+        };
+        while is_watched && begin.elapsed() < WATCHED_WITHIN && !self.is_told() {
+            std::thread::sleep(ANSWERED_WITHIN);
+        }
+        // The answer is on its way.
+        if is_watched {
+            std::thread::sleep(ANSWERED_WITHIN);
+        }
+    }
+
+    /// Whether a page has asked since the end, and has its answer.
+    fn is_told(&self) -> bool {
+        matches!(self.lock().ended, Some((_, true)))
+    }
+
     /// Takes what the training in this process reports.
     pub(crate) fn observe(&self, event: Event<'_>) {
         let Event::Snapshot { step, model, seconds } = event else { return };
@@ -113,6 +148,16 @@ impl Feed {
         true
     }
 
+    /// The model of the last checkpoint, as a file.
+    pub(super) fn file(&self) -> Option<Bytes> {
+        let path = match &self.lock().source {
+            FeedSource::Run(run) => run.path().join("model.ply"),
+            FeedSource::File(path) => path.clone(),
+            FeedSource::Fixed => return None,
+        };
+        std::fs::read(path).ok().map(Bytes::from)
+    }
+
     /// The newest model, as the viewer reads it.
     pub(super) fn model(&self) -> Option<Bytes> {
         let state = self.lock();
@@ -123,6 +168,7 @@ impl Feed {
     /// is asked for a snapshot.
     pub(super) fn state(&self) -> Value {
         let mut state = self.lock();
+        state.asked = Some(Instant::now());
         if let Some((_, answer)) = state.told.as_ref().filter(|(at, _)| at.elapsed() < STATE_EVERY)
         {
             return answer.clone();
@@ -149,6 +195,11 @@ impl Feed {
         told["fingerprint"] = state.fingerprint.clone().into();
         told["canControl"] = self.requests.is_some().into();
         told["problem"] = state.problem.clone().into();
+        if let Some((ended, is_told)) = &mut state.ended {
+            told["endedBy"] = ended.as_str().into();
+            told["canControl"] = false.into();
+            *is_told = true;
+        }
         state.told = Some((now, told.clone()));
         told
     }
@@ -168,7 +219,9 @@ impl FeedState {
             file: None,
             fingerprint: None,
             problem: None,
+            ended: None,
             next: None,
+            asked: None,
             told: None,
         }
     }

@@ -27,9 +27,11 @@ function editList(edits, model) {
   return { nightsplat_edits: EDIT_VERSION, model, edits: [...removal, ...rest] };
 }
 
-function download(name, value) {
+const asJson = (value) => new Blob([JSON.stringify(value, null, 1) + '\n'], { type: 'application/json' });
+
+function download(name, blob) {
   const link = document.createElement('a');
-  link.href = URL.createObjectURL(new Blob([JSON.stringify(value, null, 1) + '\n'], { type: 'application/json' }));
+  link.href = URL.createObjectURL(blob);
   link.download = name;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
@@ -93,8 +95,8 @@ function editor(world, restrict) {
     apply: () => { if (['sphere', 'box'].includes(tool())) { const crop = region(); element('tool').value = ''; commit({ crop }); } },
     undo: () => { edits.pop(); preview(); },
     keyframe: () => { keyframes.push(world.keyframe()); preview(); },
-    saveEdits: () => download('edits.json', list()),
-    savePath: () => download('path.json', path()),
+    saveEdits: () => download('edits.json', asJson(list())),
+    savePath: () => download('path.json', asJson(path())),
   };
   for (const [id, act] of Object.entries(actions)) element(id).addEventListener('click', act);
   for (const id of ['tool', 'sizeX', 'sizeY', 'sizeZ']) element(id).addEventListener('input', () => {
@@ -107,7 +109,7 @@ function editor(world, restrict) {
   const list = () => editList(edits, scene.model);
   const path = () => ({ nightsplat_path: 1, fps: 30, easing: 'smooth', keyframes: keyframes.map((own, k) => ({ time: 2 * k, ...own })) });
   // For scripts and tests.
-  window.nightsplat = { edits: list, path };
+  window.nightsplat = { edits: list, path, camera: world.keyframe };
 
   return {
     load: (buffer) => { model = opened(buffer); if (edits.length) preview(); },
