@@ -79,7 +79,7 @@ function keyboard(keys, commands) {
   const giveBack = () => { if (isPointer && !element('info').open) canvas.focus({ preventScroll: true }); };
   document.addEventListener('change', giveBack);
   document.addEventListener('click', (event) => { if (event.target.closest('button')) giveBack(); });
-  element('divider').addEventListener('pointerup', giveBack);
+  document.addEventListener('pointerup', ({ target }) => { if (target.matches?.('#divider, [type=range]')) giveBack(); });
 }
 
 function start(gl) {

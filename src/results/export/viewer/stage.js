@@ -28,7 +28,7 @@ function makeStage(gl) {
   const region = photographedRegion(scene.cameras.map(pose), home);
   const state = { current: { ...poses[0] }, target: home, lens: views[0], bookmark: 0, last: 0 };
   // The share of the Gaussians that is drawn while the camera moves: as many as the device draws in time.
-  let fraction = 1, moved = -Infinity, painted = 0, pending = false, fog = 0;
+  let fraction = 1, moved = -Infinity, painted = 0, pending = false, fog = 0, isCoarse = false;
   const movers = [], painters = [];
   const reach = () => Math.max(distance(state.target, state.current.eye), 2 * scene.near);
   const isShared = () => root.dataset.face === 'share';
@@ -41,7 +41,12 @@ function makeStage(gl) {
     return { size: [w, h], focal, principalPoint: [w / 2, h / 2], viewFromWorld: matrix(state.current) };
   };
   const camera = () => (state.bookmark === null ? freed() : views[state.bookmark]);
-  const refresh = () => { if (!pending) { pending = true; requestAnimationFrame(paint); } };
+  const refresh = () => {
+    if (pending) return;
+    pending = true;
+    root.dataset.settled = 'false';
+    requestAnimationFrame(paint);
+  };
   const hasMoved = () => { moved = performance.now(); refresh(); };
 
   // Moves what moves by itself.
@@ -59,9 +64,11 @@ function makeStage(gl) {
     const now = performance.now(), wasMoving = now - moved < STILL_AFTER;
     advance(wasMoving ? Math.min(0.1, (now - painted) / 1000) : 0.016);
     const isMoving = performance.now() - moved < STILL_AFTER;
-    if (isMoving && now - painted < STILL_AFTER) fraction = adapted(fraction, now - painted);
+    if (isMoving && now - painted < 10 * STILL_AFTER) fraction = adapted(fraction, now - painted);
     painted = now;
-    const ratio = window.devicePixelRatio || 1;
+    // A device that draws few in time draws fewer pixels, too.
+    isCoarse = isMoving && (isCoarse || fraction < 0.5);
+    const ratio = (window.devicePixelRatio || 1) * (isCoarse ? 0.5 : 1);
     const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((v) => Math.max(1, Math.round(v * ratio)));
     // Before grey, what black hides is seen: holes.
     const grey = element('grey').checked ? 0.5 : 0, layer = Number(element('layer').value);
