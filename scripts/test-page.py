@@ -52,7 +52,8 @@ COMPARE = """(async (png) => {
 # Key G from far away: before, after, and once the control has been clicked. The red of every pixel; alpha is ignored.
 GREY = """(async () => {
   const canvas = document.getElementById('canvas'), gl = canvas.getContext('webgl2');
-  const send = (kind, key) => canvas.dispatchEvent(new KeyboardEvent(kind, { key, shiftKey: key === 's', bubbles: true }));
+  const send = (kind, key) =>
+    canvas.dispatchEvent(new KeyboardEvent(kind, { key, shiftKey: key === 's', bubbles: true }));
   const red = async () => {
     await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
     while (document.documentElement.dataset.settled !== 'true') await new Promise((done) => setTimeout(done, 20));
@@ -238,7 +239,7 @@ def select(browser, control, value, event="change"):
     browser.evaluate(f"""(() => {{
       const control = document.getElementById('{control}');
       if (control.type === 'checkbox') control.checked = {json.dumps(value)}; else control.value = {json.dumps(value)};
-      control.dispatchEvent(new Event('{event}'));
+      control.dispatchEvent(new Event('{event}', {{ bubbles: true }}));
     }})()""")
     browser.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done())))")
     browser.settle()
@@ -294,7 +295,8 @@ def hold(browser, *keys, seconds=0.0):
     """Presses keys of the keyboard together, and waits until the camera is still."""
     for kind in ("keyDown", "keyUp"):
         for key in keys:
-            browser.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if len(key) == 1 and kind == "keyDown" else "")
+            text = key if len(key) == 1 and kind == "keyDown" else ""
+            browser.call("Input.dispatchKeyEvent", type=kind, key=key, text=text)
         if kind == "keyDown":
             time.sleep(seconds)
     browser.settle()
@@ -406,13 +408,10 @@ def live(browser, nightsplat, dataset, run):
         browser.wait("document.getElementById('progress').textContent.startsWith('stopped at step')")
         end = browser.evaluate("document.getElementById('progress').textContent")
     is_right = seconds <= 2.0 and code == 130 and "of at most 100000" in line and ", saved" in end
-    print(f"{'ok' if is_right else 'BAD':3} live: a checkpoint is shown after {seconds:.2f} s; code {code}; {line}; {end}")
-    failed += not is_right
+    failed += report(is_right, f"live: a checkpoint is shown after {seconds:.2f} s; code {code}; {line}; {end}")
     ready = browser.open((run / "exported.html").as_uri())
     is_right = ready == "true" and browser.evaluate("root.dataset.face === 'share' && !element('divider').hidden")
-    print(f"{'ok' if is_right else 'BAD':3} the page that the live page exports: {len(exported) >> 10} KiB, {ready}")
-    failed += not is_right
-    return failed
+    return failed + report(is_right, f"the page that the live page exports: {len(exported) >> 10} KiB, {ready}")
 
 
 def report(is_right, line):
@@ -422,8 +421,8 @@ def report(is_right, line):
 
 def center_of(browser, control):
     """The middle of a control on the page."""
-    script = f"(() => {{ const b = element('{control}').getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; }})()"
-    return browser.evaluate(script)
+    x, y, width, height = browser.evaluate(BOX.replace("canvas", f"element('{control}')"))
+    return x + width / 2, y + height / 2
 
 
 def press(browser, x, y, to=None):
@@ -472,11 +471,7 @@ def share(browser, page):
     failed += report(playing == "true" and begin != first != second, "play moves the camera, and P ends it")
 
     hold(browser, "r")
-    hold(browser, "Shift", "s", seconds=0.1)
-    browser.evaluate("document.dispatchEvent(new KeyboardEvent('keydown', { key: 's', shiftKey: true, bubbles: true }))")
-    time.sleep(4)
-    browser.evaluate("document.dispatchEvent(new KeyboardEvent('keyup', { key: 's', bubbles: true }))")
-    browser.settle()
+    hold(browser, "s", seconds=6)
     away = browser.evaluate("""(() => {
       const { position } = nightsplat.camera(), eyes = scene.cameras.map((own) => add(pose(own).eye, scene.origin));
       const apart = eyes.map((eye) => distance(eye, position)), across = eyes.map((eye) => distance(eye, eyes[0]));
@@ -501,7 +496,8 @@ def phone(browser, page):
         browser.open(page.as_uri(), face=face)
         browser.resize(360, 640)
         found = browser.evaluate("""(() => {
-          const controls = [...document.querySelectorAll('button, input, select, [tabindex]')].filter((own) => own.checkVisibility());
+          const all = [...document.querySelectorAll('button, input, select, [tabindex]')];
+          const controls = all.filter((own) => own.checkVisibility());
           const name = (own) => own.ariaLabel || own.textContent.trim() || own.labels?.[0]?.textContent.trim();
           return {
             cut: controls.filter((own) => {

@@ -193,7 +193,7 @@ fn overview(gaussians: &Gaussians) -> Camera {
 /// The points of a dataset, in the colours of photographs, as bright as is seen well.
 fn points(dataset: &Dataset) -> crate::Result<Gaussians> {
     /// Standard deviation of a point, relative to the distance of the cameras.
-    const SIZE: f64 = 0.002;
+    const SIZE: f64 = 0.003;
     let origin = dataset.frame().file_origin();
     let positions: Vec<DVec3> =
         dataset.points.iter().map(|point| point.position - origin).collect();

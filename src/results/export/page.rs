@@ -294,6 +294,13 @@ mod tests {
         let lit = ModelPage { lamp: Some(Lamp::AT_CAMERA), ..page.clone() }.html().unwrap();
         assert!(lit.contains("\"reference_distance\":1.0") && html.contains("\"lamp\":null"));
         assert_eq!(html.matches("<script").count(), html.matches("</script>").count());
+        assert!(html.contains("<meta property=\"og:title\"") && !html.contains("og:image"));
+        assert!(html.contains("script-src 'sha256-") && !html.contains("unsafe"));
+        assert_eq!(
+            html.matches("\"viewFromWorld\"").count(),
+            1 + 67,
+            "of 200 cameras, every third"
+        );
         for outside in ["http://", "https://", "src=\"/", "@import"] {
             assert!(!html.contains(outside), "{outside}");
         }

@@ -84,6 +84,23 @@ function placed(camera, width, height) {
   return { zoom, left: (width - zoom * camera.size[0]) / 2, top: (height - zoom * camera.size[1]) / 2 };
 }
 
+// A camera that looks at a point, upright.
+function looking(eye, target) {
+  const away = add(target, eye, -1), forward = away.map((v) => v / Math.hypot(...away));
+  const side = cross(forward, scene.up), right = side.map((v) => v / Math.hypot(...side));
+  return { eye, forward, right, down: cross(forward, right) };
+}
+
+// A camera that sees all the others and what they look at, from outside and above; and the point that it looks at.
+function overview(poses, home) {
+  const middle = [0, 1, 2].map((k) => poses.reduce((sum, { eye }) => sum + eye[k], 0) / poses.length);
+  const extent = Math.max(...poses.map(({ eye }) => distance(eye, home)));
+  const out = add(middle, home, -1), level = add(out, scene.up, -dot(out, scene.up)), length = Math.hypot(...level);
+  const side = length > 0.1 * extent ? level.map((v) => v / length) : poses[0].right;
+  const target = mix(home, middle, 0.4);
+  return [looking(add(add(home, side, 1.9 * extent), scene.up, 1.1 * extent), target), target];
+}
+
 // Where a camera sees points as the photographs do: near their cameras, and along the lines of sight.
 function photographedRegion(poses, target) {
   const away = poses.map(({ eye }) => distance(eye, target)).sort((a, b) => a - b)[poses.length >> 1];

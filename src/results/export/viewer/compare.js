@@ -17,7 +17,8 @@ function comparison(stage) {
     const at = left + share * across[1];
     Object.assign(element('overlay').style,
       { left: `${fit.left}px`, top: `${fit.top}px`, width: `${at - fit.left}px`, height: `${height}px` });
-    Object.assign(divider.style, { left: `${at}px`, top: `${Math.max(0, fit.top)}px`, height: `${Math.min(height, canvas.clientHeight)}px` });
+    Object.assign(divider.style,
+      { left: `${at}px`, top: `${Math.max(0, fit.top)}px`, height: `${Math.min(height, canvas.clientHeight)}px` });
     divider.setAttribute('aria-valuenow', Math.round(100 * share));
     const image = element('picture');
     if (image.getAttribute('src') !== picture.image) image.src = picture.image;
@@ -42,7 +43,8 @@ function comparison(stage) {
 
   // The view with a picture whose camera is nearest to where the camera is.
   const nearest = () => {
-    const apart = views.map(({ pictures }, k) => (pictures.length ? distance(stage.poses[k].eye, state.current.eye) : Infinity));
+    const away = (k) => distance(stage.poses[k].eye, state.current.eye);
+    const apart = views.map(({ pictures }, k) => (pictures.length ? away(k) : Infinity));
     return apart.indexOf(Math.min(...apart));
   };
   return {

@@ -26,7 +26,8 @@ async function unpack() {
 // Views of a packed model: positions, and all else as half floats.
 function opened(buffer) {
   const [count, degree] = new Uint32Array(buffer, 0, 2);
-  return { count, degree, means: new Float32Array(buffer, 8, 3 * count), rest: new Uint16Array(buffer, 8 + 12 * count) };
+  const means = new Float32Array(buffer, 8, 3 * count);
+  return { count, degree, means, rest: new Uint16Array(buffer, 8 + 12 * count) };
 }
 
 // Mean and opacity, then the covariance R S S^T R^T, then how well photographs show it.
@@ -44,7 +45,8 @@ function geometry({ count, means, rest }, seen) {
     const entry = (a, b) => square.reduce((sum, s, k) => sum + turn[3 * a + k] * s * turn[3 * b + k], 0);
     data.set(means.subarray(3 * i, 3 * i + 3), at);
     data[at + 3] = 1 / (1 + Math.exp(-halves[rest[i]]));
-    data.set([entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2), seen ? seen[i] : 1], at + 4);
+    data.set([entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)], at + 4);
+    data[at + 10] = seen ? seen[i] : 1;
   }
   return data;
 }
@@ -126,12 +128,18 @@ function program(gl, vertex, fragment) {
   return built;
 }
 
+function unfiltered(gl) {
+  for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+    gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+  }
+}
+
 // A texture at a unit, whose contents are replaced: full rows; what does not fit the device is refused.
 function texture(gl, unit, [internal, format, type]) {
   const own = gl.createTexture();
   gl.activeTexture(gl.TEXTURE0 + unit);
   gl.bindTexture(gl.TEXTURE_2D, own);
-  for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+  unfiltered(gl);
   return (data) => {
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE), width = Math.min(most, 4096);
     const height = Math.max(1, Math.ceil(data.length / 4 / width));
@@ -183,7 +191,7 @@ function renderer(gl, changed) {
     size = [canvas.width, canvas.height] = [width, height];
     gl.activeTexture(gl.TEXTURE2);
     gl.bindTexture(gl.TEXTURE_2D, image);
-    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+    unfiltered(gl);
     const [internal, type] = fine ? [gl.RGBA16F, gl.HALF_FLOAT] : [gl.RGBA8, gl.UNSIGNED_BYTE];
     gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, gl.RGBA, type, null);
     gl.bindFramebuffer(gl.FRAMEBUFFER, sums);

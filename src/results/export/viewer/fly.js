@@ -133,7 +133,8 @@ function player(stage) {
 function pointing(stage, moves, edit, began) {
   const { state } = stage, pointers = new Map();
   let spread = 0, thrown = [0, 0], last = 0;
-  const pixel = () => stage.reach() / (state.lens.focal[1] * placed(state.lens, canvas.clientWidth, canvas.clientHeight).zoom);
+  const zoom = () => placed(state.lens, canvas.clientWidth, canvas.clientHeight).zoom;
+  const pixel = () => stage.reach() / (state.lens.focal[1] * zoom());
   const glide = (seconds) => {
     thrown = thrown.map((v) => v * Math.exp(-seconds / GLIDE));
     moves.turn(thrown[0] * seconds, thrown[1] * seconds);
@@ -151,7 +152,8 @@ function pointing(stage, moves, edit, began) {
   for (const end of ['pointerup', 'pointercancel']) canvas.addEventListener(end, (event) => {
     edit.ends();
     if (!pointers.delete(event.pointerId)) return;
-    if (end === 'pointerup' && event.timeStamp - last < 60 && Math.hypot(...thrown) > 0.2 && !prefersStill()) stage.animate(glide);
+    const isThrown = end === 'pointerup' && event.timeStamp - last < 60 && Math.hypot(...thrown) > 0.2;
+    if (isThrown && !prefersStill()) stage.animate(glide);
   });
   canvas.addEventListener('pointermove', (event) => {
     if (edit.moves(...onCanvas(event))) return;
@@ -182,9 +184,7 @@ function pointing(stage, moves, edit, began) {
     const point = stage.pointAt(...onCanvas(event));
     if (!point) { say('Nothing is there.'); return; }
     began();
-    const { eye } = state.current, away = add(point, eye, -1), forward = away.map((v) => v / Math.hypot(...away));
-    const side = cross(forward, scene.up), right = side.map((v) => v / Math.hypot(...side));
-    stage.flyTo({ eye, forward, right, down: cross(forward, right) }, 0.5);
+    stage.flyTo(looking(state.current.eye, point), 0.5);
     state.target = point;
   });
 }

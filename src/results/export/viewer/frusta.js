@@ -1,7 +1,10 @@
 // The cameras of the photographs, drawn in space with names and photographs: one sees where poses are wrong.
 
 // Names of more cameras than this are shown under the cursor only.
-const MOST_NAMES = 40;
+const MOST_NAMES = 60;
+// The width of the photograph of the camera under the cursor, in CSS pixels.
+const PREVIEW = 260;
+const CHOSEN = '#ffd54a', OTHER = '#6cf';
 // How near to a camera's eye the cursor chooses it, in CSS pixels.
 const CHOSEN_WITHIN = 18;
 
@@ -10,16 +13,18 @@ function visible(image) {
   const small = Object.assign(document.createElement('canvas'), { width: 16, height: 16 });
   const context = small.getContext('2d', { willReadFrequently: true });
   context.drawImage(image, 0, 0, 16, 16);
-  const data = context.getImageData(0, 0, 16, 16).data, mean = data.reduce((sum, v, k) => sum + (k % 4 < 3 ? v : 0), 0) / 768;
+  const { data } = context.getImageData(0, 0, 16, 16);
+  const mean = data.reduce((sum, v, k) => sum + (k % 4 < 3 ? v : 0), 0) / 768;
   return clamp(100 / Math.max(mean, 1), 1, 16);
 }
 
 function showCameras(stage) {
   const { state, views, poses } = stage, over = element('frusta'), context = over.getContext('2d');
   // Frusta are as long as a part of the usual distance between a camera and its nearest neighbour.
-  const apart = poses.map(({ eye }, k) => Math.min(...poses.map((other, j) => (j === k ? Infinity : distance(eye, other.eye)))));
+  const to = ({ eye }) => poses.map((other) => distance(eye, other.eye) || Infinity);
+  const apart = poses.map((own) => Math.min(...to(own)));
   const usual = apart.filter(Number.isFinite).sort((a, b) => a - b)[apart.length >> 1] ?? stage.reach() / 4;
-  const length = clamp(0.6 * usual, 0.02 * stage.reach(), 0.25 * stage.reach());
+  const length = clamp(0.6 * usual, 0.06 * stage.reach(), 0.25 * stage.reach());
   const corners = views.map(({ size, focal, principalPoint }, k) => [[0, 0], [1, 0], [1, 1], [0, 1]].map((corner) => {
     const [x, y] = corner.map((v, axis) => (v * size[axis] - principalPoint[axis]) / focal[axis] * length);
     return add(add(add(poses[k].eye, poses[k].forward, length), poses[k].right, x), poses[k].down, y);
@@ -35,7 +40,10 @@ function showCameras(stage) {
     if (!pictures.has(k)) {
       const image = new Image();
       pictures.set(k, { image, isLoaded: false });
-      image.onload = () => { pictures.set(k, { image, isLoaded: true, filter: `brightness(${visible(image)})` }); draw(); };
+      image.onload = () => {
+        pictures.set(k, { image, isLoaded: true, filter: `brightness(${visible(image)})` });
+        draw();
+      };
       image.src = first.image;
     }
     return pictures.get(k);
@@ -56,6 +64,18 @@ function showCameras(stage) {
     context.drawImage(own.image, 0, 0);
     context.restore();
   };
+  // That of the camera under the cursor is large enough to be recognized.
+  const preview = () => {
+    const own = hovered === null ? null : picture(hovered);
+    if (!own?.isLoaded) return;
+    const height = PREVIEW * own.image.naturalHeight / own.image.naturalWidth, top = canvas.clientHeight - height - 16;
+    context.filter = own.filter;
+    context.drawImage(own.image, 16, top, PREVIEW, height);
+    context.filter = 'none';
+    context.lineWidth = 2;
+    context.strokeStyle = CHOSEN;
+    context.strokeRect(16, top, PREVIEW, height);
+  };
   const draw = () => {
     const ratio = window.devicePixelRatio || 1;
     [over.width, over.height] = [canvas.clientWidth * ratio, canvas.clientHeight * ratio];
@@ -70,17 +90,18 @@ function showCameras(stage) {
       if (k === state.bookmark || [eyes[k], ...plane].some(([, , depth]) => !(depth > scene.near))) continue;
       const isChosen = k === hovered;
       if (isChosen || views.length <= MOST_NAMES) paste(k, plane);
-      context.strokeStyle = isChosen ? '#ffd54a' : '#6cf';
+      context.strokeStyle = isChosen ? CHOSEN : OTHER;
       context.lineWidth = isChosen ? 2.5 : 1.2;
       line([...plane, plane[0]]);
       for (const corner of plane) line([eyes[k], corner]);
       if (!isChosen && views.length > MOST_NAMES) continue;
       context.lineWidth = 3;
       context.strokeStyle = '#000a';
-      context.fillStyle = isChosen ? '#ffd54a' : '#fff';
+      context.fillStyle = isChosen ? CHOSEN : '#fff';
       context.strokeText(views[k].name, eyes[k][0] + 6, eyes[k][1] - 6);
       context.fillText(views[k].name, eyes[k][0] + 6, eyes[k][1] - 6);
     }
+    preview();
   };
   const under = (event) => {
     const at = onCanvas(event), apart = poses.map(({ eye }, k) => {
@@ -96,7 +117,9 @@ function showCameras(stage) {
     const found = under(event);
     if (found !== hovered) { hovered = found; canvas.style.cursor = found === null ? '' : 'pointer'; draw(); }
   });
-  canvas.addEventListener('pointerdown', (event) => { pressed = isShown() ? { at: onCanvas(event), view: under(event) } : null; });
+  canvas.addEventListener('pointerdown', (event) => {
+    pressed = isShown() ? { at: onCanvas(event), view: under(event) } : null;
+  });
   // A click on a camera goes there.
   canvas.addEventListener('pointerup', (event) => {
     if (pressed?.view == null || distance(onCanvas(event), pressed.at) > 4 || element('tool').value) return;

@@ -57,20 +57,22 @@ async function sharedPage(source, buffer) {
   const every = Math.max(1, Math.ceil(scene.views.length / MOST_SHARED));
   const views = scene.views.filter((_, k) => k % every === 0), pictures = views.map(async (view) => {
     // Of a server that has ended, the page has none.
-    const images = view.pictures.map(async ({ label, image }) => ({ label, image: await asUri(await (await asked(image)).blob()) }));
+    const fetched = async (image) => asUri(await (await asked(image)).blob());
+    const images = view.pictures.map(async ({ label, image }) => ({ label, image: await fetched(image) }));
     return (await Promise.allSettled(images)).flatMap(({ value }) => value ?? []);
   });
   const own = { ...scene, isLive: false, showsCameras: false, views: [] };
   for (const [k, view] of views.entries()) own.views.push({ ...view, pictures: await pictures[k] });
   const packed = await new Response(new Blob([buffer]).stream().pipeThrough(new CompressionStream('gzip'))).blob();
   const model = (await asUri(packed)).replace(/^.*,/, '');
-  const within = (page, id, text) => page.replace(new RegExp(`(<script id="${id}"[^>]*>)[^<]*`), (_, begin) => begin + text);
+  const within = (page, id, text) =>
+    page.replace(new RegExp(`(<script id="${id}"[^>]*>)[^<]*`), (_, begin) => begin + text);
   return within(within(source, 'scene', JSON.stringify(own).replaceAll('<', '\\u003c')), 'model', model);
 }
 
 // Shows every model that comes; returns once the first is shown.
 async function follow(show) {
-  element('live').hidden = false;
+  element('live').hidden = scene.showsCameras;
   let version = 0, isPaused = false, hasEnded = false, buffer = null;
   const source = await (await asked('')).text();
   const order = async (what) => { await fetch(`do/${what}`, { method: 'POST' }); await look(); };
@@ -109,7 +111,8 @@ async function follow(show) {
     try {
       if (!document.hidden) await look();
     } catch (error) {
-      element('progress').textContent = 'the program that serves this page has ended or cannot be reached; the last model is shown';
+      element('progress').textContent =
+        'the program that serves this page has ended or cannot be reached; the last model is shown';
       element('controls').hidden = true;
     }
     if (!hasEnded) setTimeout(again, ASK_EVERY);

@@ -32,7 +32,7 @@ function hints() {
     clearTimeout(timer);
     root.dataset.idle = 'false';
     timer = setTimeout(() => {
-      const isBusy = element('bar').contains(document.activeElement) && document.activeElement.matches(':focus-visible');
+      const isBusy = Boolean(element('bar').querySelector(':focus-visible'));
       root.dataset.idle = String(!isBusy && (root.dataset.playing === 'true' || Boolean(document.fullscreenElement)));
     }, IDLE_AFTER);
   };
@@ -79,7 +79,9 @@ function keyboard(keys, commands) {
   const giveBack = () => { if (isPointer && !element('info').open) canvas.focus({ preventScroll: true }); };
   document.addEventListener('change', giveBack);
   document.addEventListener('click', (event) => { if (event.target.closest('button')) giveBack(); });
-  document.addEventListener('pointerup', ({ target }) => { if (target.matches?.('#divider, [type=range]')) giveBack(); });
+  document.addEventListener('pointerup', ({ target }) => {
+    if (target.matches?.('#divider, [type=range]')) giveBack();
+  });
 }
 
 function start(gl) {
@@ -103,10 +105,16 @@ function start(gl) {
   const reset = () => {
     compare.middle();
     for (const id of ['grey', 'lamp', 'difference']) element(id).checked = false;
-    for (const id of ['layer', 'brightness', 'warmth']) { element(id).value = '0'; element(id).dispatchEvent(new Event('input')); }
+    for (const id of ['layer', 'brightness', 'warmth']) {
+      element(id).value = '0';
+      element(id).dispatchEvent(new Event('input'));
+    }
     state.last = asked && views[asked[1]] ? Number(asked[1]) : 0;
     back();
-    if (views[state.last].pictures.length && !scene.showsCameras) element('compare').value = '0';
+    if (scene.showsCameras) {
+      stage.choose(null);
+      [state.current, state.target] = overview(poses, stage.home);
+    } else if (views[state.last].pictures.length) element('compare').value = '0';
     canvas.focus({ preventScroll: true });
   };
   const fillScreen = () => {
@@ -121,8 +129,8 @@ function start(gl) {
   };
   for (const [id, act] of Object.entries(actions)) element(id).addEventListener('click', act);
   keyboard({ ...keys, press: (key, fast) => { play.stop(); keys.press(key, fast); } }, {
-    g: click('grey'), l: click('lamp'), r: back, f: fillScreen, home: reset, p: play.toggle, b: actions.before, i: toggleFace,
-    ' ': play.toggle, '?': actions.about,
+    g: click('grey'), l: click('lamp'), r: back, f: fillScreen, home: reset, p: play.toggle, ' ': play.toggle,
+    b: actions.before, i: toggleFace, '?': actions.about,
   });
   pointing(stage, moves, edit, play.stop);
   showCameras(stage);
@@ -132,7 +140,7 @@ function start(gl) {
     play.stop();
     stage.choose(value === '' ? null : Number(value));
   });
-  for (const id of ['compare', 'grey', 'layer', 'difference', 'lamp', 'cameras']) element(id).addEventListener('change', stage.refresh);
+  element('panel').addEventListener('change', stage.refresh);
   sliders(stage);
   new ResizeObserver(stage.refresh).observe(canvas);
   reset();
@@ -146,15 +154,16 @@ function start(gl) {
 
 // Brightness in stops, and the colour of white; in the middle, the model as it was trained.
 function sliders(stage) {
-  const say = {
-    brightness: (value) => (value ? `${value > 0 ? '+' : '−'}${Math.abs(value).toFixed(1)} stops` : 'as trained'),
-    warmth: (value) => (value ? `${Math.round(100 * Math.abs(value) / 0.6)} % ${value > 0 ? 'warmer' : 'cooler'}` : 'as trained'),
+  const inWords = {
+    brightness: (value) => `${value > 0 ? '+' : '−'}${Math.abs(value).toFixed(1)} stops`,
+    warmth: (value) => `${Math.round(Math.abs(value) / 0.006)} % ${value > 0 ? 'warmer' : 'cooler'}`,
   };
-  for (const [id, words] of Object.entries(say)) {
+  for (const [id, words] of Object.entries(inWords)) {
     const slider = element(id);
     slider.addEventListener('input', () => {
-      slider.setAttribute('aria-valuetext', words(Number(slider.value)));
-      slider.title = `${slider.getAttribute('aria-label')}: ${words(Number(slider.value))}`;
+      const text = Number(slider.value) ? words(Number(slider.value)) : 'as trained';
+      slider.setAttribute('aria-valuetext', text);
+      slider.title = `${slider.ariaLabel}: ${text}`;
       stage.refresh();
     });
     slider.addEventListener('dblclick', () => { slider.value = 0; slider.dispatchEvent(new Event('input')); });
@@ -173,7 +182,8 @@ function countUnder(stage) {
 
 async function open() {
   const gl = canvas.getContext('webgl2', { antialias: false, preserveDrawingBuffer: true });
-  if (!gl) throw new Error('this browser has no WebGL 2; turn hardware acceleration on, or open model.ply in another viewer');
+  const lacks = 'this browser has no WebGL 2; turn hardware acceleration on, or open model.ply in another viewer';
+  if (!gl) throw new Error(lacks);
   const show = start(gl);
   if (scene.isLive) await follow(show);
   else show(await unpack());

@@ -1,5 +1,6 @@
 #version 300 es
-// One corner of a splat: the projection of the kernels (EWA), with their constants and harmonics, on textures of three and of (degree + 1)^2 texels a Gaussian.
+// One corner of a splat: the projection of the kernels (EWA), with their constants and harmonics, on textures of three
+// and of (degree + 1)^2 texels a Gaussian.
 precision highp float;
 precision highp int;
 precision highp sampler2D;

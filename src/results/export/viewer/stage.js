@@ -17,7 +17,8 @@ function adapted(share, milliseconds) {
 
 // The factors on red, green and blue that the sliders ask for. Warmer is redder, at the same brightness.
 function look(edge) {
-  const gain = 2 ** Number(element('brightness').value) * (1 - LIMIT_SHADE * edge), warmth = Number(element('warmth').value);
+  const [stops, warmth] = ['brightness', 'warmth'].map((id) => Number(element(id).value));
+  const gain = 2 ** stops * (1 - LIMIT_SHADE * edge);
   return [gain * 2 ** warmth, gain * 2 ** (-0.1 * warmth), gain * 2 ** (-1.4 * warmth)];
 }
 
@@ -127,7 +128,7 @@ function makeStage(gl) {
     return { position: add(eye, scene.origin), rotation: quaternion(axes), fov: fov * 180 / Math.PI };
   };
   const stage = {
-    views, poses, home, region, state, layers, load, restrict, sumsAt, camera, reach, refresh, hasMoved, animate, rest, free,
+    views, poses, home, region, state, layers, load, restrict, sumsAt, reach, refresh, hasMoved, animate, rest, free,
     flyTo, projected, pointAt, keyframe, isLimited, painters, choose: () => {},
   };
   return stage;
