@@ -12,7 +12,6 @@ use crate::gpu::DeviceChoice;
 use crate::results::export::streamed::{self, Division, MAX_LEVELS, Written};
 use crate::results::export::{Format, spz};
 use crate::results::finished_run::is_model;
-use crate::results::run_export::fit::Fitted;
 use crate::results::run_export::up::{Turn, Up};
 use crate::results::run_export::{ExportOptions, Exported};
 use crate::train::CacheSize;
@@ -146,11 +145,6 @@ fn line(source: &Path, exported: &Exported) -> String {
             "{shown}: {levels} levels of {numbers} Gaussians in {chunks} chunks, {kib} KiB{turn}"
         );
     }
-    let fitted = fitted.map(|Fitted { level, degrees: [degree, all] }| {
-        let halved = if level > 0 { format!(", level {level}") } else { String::new() };
-        format!("; of SH degree {degree} of {all}{halved}, to fit")
-    });
-    let fitted = fitted.unwrap_or_default();
     let brightness = if is_model(source) { "" } else { ", as bright as their targets" };
     let relative = relative_to(*origin).map(|line| format!("; {line}")).unwrap_or_default();
     format!("{shown}: {count} Gaussians in {kib} KiB{brightness}{fitted}{turn}{relative}")
@@ -209,16 +203,15 @@ fn check_levels(args: &ExportArgs) -> crate::Result<()> {
 /// Refuses what only pages have, and a size of what has a layout of its own.
 fn check_page(args: &ExportArgs) -> crate::Result<()> {
     let is_sized = !matches!(args.format, Format::Ply | Format::StreamedSog);
-    let problem = match args {
-        ExportArgs { max_size: Some(_), .. } if !is_sized => {
-            "--max-size is of --format html, spz, glb and sog; pass --level for another"
-        }
-        ExportArgs { title: None, text: None, url: None, .. } => return Ok(()),
-        ExportArgs { url: Some(url), .. } if !url.starts_with("http") => {
-            "--url is an address such as https://example.org/room/"
-        }
-        _ if args.format != Format::Html => "--title, --text and --url are of --format html",
-        _ => return Ok(()),
+    let has_page_options = args.title.is_some() || args.text.is_some() || args.url.is_some();
+    let problem = if args.max_size.is_some() && !is_sized {
+        "--max-size is of --format html, spz, glb and sog; pass --level for another"
+    } else if has_page_options && args.format != Format::Html {
+        "--title, --text and --url are of --format html"
+    } else if args.url.as_ref().is_some_and(|url| !url.starts_with("http")) {
+        "--url is an address such as https://example.org/room/"
+    } else {
+        return Ok(());
     };
     Err(Error::Usage(problem.to_owned()))
 }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 use anyhow::Result;
-use glam::{DAffine3, DVec3, Vec3};
+use glam::{DAffine3, DVec2, DVec3, Vec3};
 use nightsplat_core::camera::Camera;
 use nightsplat_photographs::dataset::Dataset;
 
@@ -197,14 +197,11 @@ fn points(dataset: &Dataset) -> crate::Result<Gaussians> {
     let origin = dataset.frame().file_origin();
     let positions: Vec<DVec3> =
         dataset.points.iter().map(|point| point.position - origin).collect();
-    let start = Initialization { opacity: 0.9, ..Initialization::default() };
-    let mut gaussians =
-        Gaussians::from_points(&positions, &point_colors(dataset)?, Shape::default(), &start, 0)?;
-    let centers = dataset.views.iter().map(|view| view.camera.center() - origin);
-    let mut distances: Vec<f64> = centers
-        .zip(positions.iter().cycle().step_by(97))
-        .map(|(center, point)| center.distance(*point))
-        .collect();
+    let (colors, start) = (point_colors(dataset), Initialization::default());
+    let start = Initialization { opacity: 0.9, ..start };
+    let mut gaussians = Gaussians::from_points(&positions, &colors, Shape::default(), &start, 0)?;
+    let eye = dataset.views.first().map_or(origin, |view| view.camera.center()) - origin;
+    let mut distances: Vec<f64> = positions.iter().map(|point| eye.distance(*point)).collect();
     distances.sort_by(f64::total_cmp);
     let distance = distances.get(distances.len() / 2).copied().unwrap_or(1.0).max(1e-6);
     gaussians.log_scales_mut().fill(Vec3::splat((SIZE * distance).ln() as f32));
@@ -213,7 +210,7 @@ fn points(dataset: &Dataset) -> crate::Result<Gaussians> {
 }
 
 /// The colour of every point in the first photograph that shows it, all brightened alike; grey without one.
-fn point_colors(dataset: &Dataset) -> crate::Result<Vec<Vec3>> {
+fn point_colors(dataset: &Dataset) -> Vec<Vec3> {
     const GREY: Vec3 = Vec3::splat(0.6);
     /// The most photographs that are decoded.
     const PHOTOGRAPHS: usize = 24;
@@ -222,25 +219,19 @@ fn point_colors(dataset: &Dataset) -> crate::Result<Vec<Vec3>> {
     let mut colors: Vec<Option<Vec3>> = vec![None; dataset.points.len()];
     let every = dataset.views.len().div_ceil(PHOTOGRAPHS).max(1);
     for (index, view) in dataset.views.iter().enumerate().step_by(every) {
-        let Some(photograph) = view.loaded()? else { continue };
-        let (width, height) = (photograph.width, photograph.height);
+        let Ok(Some(photograph)) = view.loaded() else { continue };
+        let size = DVec2::new(photograph.width.into(), photograph.height.into());
         for (point, color) in dataset.points.iter().zip(&mut colors) {
             let is_seen = point.views.is_empty() || point.views.contains(&(index as u32));
-            let pixel = view.camera.project(point.position).filter(|pixel| {
-                let inside = pixel.x >= 0.0 && pixel.y >= 0.0;
-                inside && pixel.x < f64::from(width) && pixel.y < f64::from(height)
-            });
-            if let (None, true, Some(pixel)) = (&color, is_seen, pixel) {
-                *color = Some(Vec3::from(photograph.pixel(pixel.x as u32, pixel.y as u32)));
+            let pixel = view.camera.project(point.position).filter(|_| is_seen && color.is_none());
+            if let Some(at) = pixel.filter(|at| at.min_element() >= 0.0 && at.cmplt(size).all()) {
+                *color = Some(Vec3::from(photograph.pixel(at.x as u32, at.y as u32)));
             }
         }
     }
-    let mut brightness: Vec<f32> =
-        colors.iter().flatten().map(|color| color.max_element()).collect();
+    let mut brightness: Vec<f32> = colors.iter().flatten().map(|c| c.max_element()).collect();
     brightness.sort_by(f32::total_cmp);
     let bright = brightness.get(brightness.len() * 19 / 20).copied().unwrap_or(BRIGHT).max(1e-3);
-    let shown = |color: Option<Vec3>| {
-        color.map_or(GREY, |color| (color * (BRIGHT / bright)).clamp(Vec3::ZERO, Vec3::ONE))
-    };
-    Ok(colors.into_iter().map(shown).collect())
+    let shown = |color: Vec3| (color * (BRIGHT / bright)).clamp(Vec3::ZERO, Vec3::ONE);
+    colors.into_iter().map(|color| color.map_or(GREY, shown)).collect()
 }

@@ -25,10 +25,8 @@ const SNAPSHOT_EVERY: Duration = Duration::from_secs(1);
 const SNAPSHOT_SHARE: f64 = 0.04;
 /// Progress is read from files at most this often, however many pages ask.
 const STATE_EVERY: Duration = Duration::from_millis(250);
-/// A page that has not asked for so long is closed, or hidden.
-const WATCHED_WITHIN: Duration = Duration::from_millis(2500);
-/// The time that an answer takes to its page.
-const ANSWERED_WITHIN: Duration = Duration::from_millis(100);
+/// A page that has not asked for so long is closed, or hidden; others ask once a second.
+const WATCHED_WITHIN: Duration = Duration::from_secs(2);
 
 /// What is shown.
 #[derive(Debug)]
@@ -62,8 +60,8 @@ struct FeedState {
     fingerprint: Option<String>,
     /// Why the newest model cannot be shown, on one line.
     problem: Option<String>,
-    /// How the training in this process ended, and whether a page knows.
-    ended: Option<(String, bool)>,
+    /// How the training in this process ended.
+    ended: Option<String>,
     /// When the next snapshot may be requested.
     next: Option<Instant>,
     /// When a page last asked.
@@ -101,26 +99,16 @@ impl Feed {
         matches!(self.lock().source, FeedSource::Fixed)
     }
 
-    /// Takes how the training in this process ended, on one line, and waits until a page that is open has asked for it.
+    /// Takes how the training in this process ended, on one line, and gives a page that is open the time to ask for it.
     pub(crate) fn end(&self, ended: &str) {
-        let (is_watched, begin) = {
+        let is_watched = {
             let mut state = self.lock();
-            state.told = None;
-            state.ended = Some((ended.to_owned(), false));
-            (state.asked.is_some_and(|at| at.elapsed() < WATCHED_WITHIN), Instant::now())
+            (state.told, state.ended) = (None, Some(ended.to_owned()));
+            state.asked.is_some_and(|at| at.elapsed() < WATCHED_WITHIN)
         };
-        while is_watched && begin.elapsed() < WATCHED_WITHIN && !self.is_told() {
-            std::thread::sleep(ANSWERED_WITHIN);
-        }
-        // The answer is on its way.
         if is_watched {
-            std::thread::sleep(ANSWERED_WITHIN);
+            std::thread::sleep(WATCHED_WITHIN);
         }
-    }
-
-    /// Whether a page has asked since the end, and has its answer.
-    fn is_told(&self) -> bool {
-        matches!(self.lock().ended, Some((_, true)))
     }
 
     /// Takes what the training in this process reports.
@@ -146,16 +134,6 @@ impl Feed {
         }
         self.lock().told = None;
         true
-    }
-
-    /// The model of the last checkpoint, as a file.
-    pub(super) fn file(&self) -> Option<Bytes> {
-        let path = match &self.lock().source {
-            FeedSource::Run(run) => run.path().join("model.ply"),
-            FeedSource::File(path) => path.clone(),
-            FeedSource::Fixed => return None,
-        };
-        std::fs::read(path).ok().map(Bytes::from)
     }
 
     /// The newest model, as the viewer reads it.
@@ -195,10 +173,8 @@ impl Feed {
         told["fingerprint"] = state.fingerprint.clone().into();
         told["canControl"] = self.requests.is_some().into();
         told["problem"] = state.problem.clone().into();
-        if let Some((ended, is_told)) = &mut state.ended {
-            told["endedBy"] = ended.as_str().into();
-            told["canControl"] = false.into();
-            *is_told = true;
+        if state.ended.is_some() {
+            (told["endedBy"], told["canControl"]) = (state.ended.clone().into(), false.into());
         }
         state.told = Some((now, told.clone()));
         told

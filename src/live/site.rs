@@ -51,7 +51,6 @@ impl Site {
     /// | | the page |
     /// | `state` | the progress, as JSON |
     /// | `model` | the model, as the viewer reads it |
-    /// | `model.ply` | the model of the last checkpoint, as a file |
     /// | `picture/VIEW/KIND` | a photograph, target or reference image, as JPEG |
     /// | `do/WHAT` (POST) | pause, resume, save or stop |
     pub(super) fn answer(&self, method: &Method, path: &str) -> Answer {
@@ -63,10 +62,6 @@ impl Site {
             }
             ("GET", ["model"]) => match self.feed.model() {
                 Some(model) => Answer::ok("application/octet-stream", model),
-                None => Answer::NOT_FOUND,
-            },
-            ("GET", ["model.ply"]) => match self.feed.file() {
-                Some(file) => Answer::ok("application/octet-stream", file),
                 None => Answer::NOT_FOUND,
             },
             ("GET", ["picture", view, kind]) => self.picture(view, kind),

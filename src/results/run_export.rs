@@ -1,6 +1,6 @@
 //! The export of a run or of a model file.
 
-pub(crate) mod fit;
+mod fit;
 mod page;
 pub(crate) mod up;
 
@@ -12,7 +12,6 @@ use nightsplat_core::output::{create_folder_of, is_same_file, own_file, write_wh
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::scene_tone::SceneTone;
 
-use self::fit::Fitted;
 use self::up::Turn;
 pub use self::up::Up;
 use crate::results::edit::fingerprint;
@@ -62,8 +61,8 @@ pub(crate) struct Exported {
     pub(crate) path: PathBuf,
     /// The number of Gaussians of the finest level.
     pub(crate) count: usize,
-    /// What a limited size left of the model.
-    pub(crate) fitted: Option<Fitted>,
+    /// What a limited size left of the model; empty without a limit.
+    pub(crate) fitted: String,
     /// The levels of a streamed model.
     pub(crate) streamed: Option<Written>,
     /// The position in the world that those of the file are relative to.
@@ -101,7 +100,7 @@ impl ExportOptions<'_> {
         let path = self.path()?;
         let written = streamed::write(&path, &tiles, &provenance, self.division)?;
         let (count, origin) = (written.counts[0], DVec3::ZERO);
-        Ok(Exported { path, count, fitted: None, streamed: Some(written), origin, turn })
+        Ok(Exported { path, count, fitted: String::new(), streamed: Some(written), origin, turn })
     }
 
     fn write_whole(&self, joined: Option<&TileManifest>) -> Result<Exported> {
@@ -138,11 +137,10 @@ impl ExportOptions<'_> {
             _ => None,
         };
         let write = |model: &Gaussians| self.write_file(model, &provenance, page.as_ref(), &path);
-        let (mut fitted, mut streamed) = (None, None);
+        let (mut fitted, mut streamed) = (String::new(), None);
         if let Some(most) = self.max_size {
-            let (model, left) =
-                self.fit(&gaussians, &path, most, |model| write(model).map(drop))?;
-            (gaussians, fitted) = (model, Some(left));
+            let write = |model: &Gaussians| write(model).map(drop);
+            (gaussians, fitted) = self.fit(&gaussians, &path, most, write)?;
         } else {
             streamed = write(&gaussians)?;
         }

@@ -10,25 +10,16 @@ use crate::{Error, Result};
 /// A model with fewer Gaussians than this is no model.
 const LEAST_GAUSSIANS: usize = 100;
 
-/// What a limited size left of a model.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Fitted {
-    /// The level of detail.
-    pub(crate) level: usize,
-    /// The SH degree, and that of the model.
-    pub(crate) degrees: [u32; 2],
-}
-
 impl ExportOptions<'_> {
-    /// Writes the file again and again, until it has at most this many bytes; returns the model that it then has. Each
-    /// level of detail is tried with as many coefficients as fit: half of the Gaussians are a larger loss.
+    /// Writes the file again and again, until it has at most this many bytes; returns the model that it then has, and
+    /// what that is. Each level of detail is tried with all coefficients first: half of the Gaussians are a larger loss.
     pub(super) fn fit(
         &self,
         gaussians: &Gaussians,
         path: &Path,
         most: u64,
         write: impl Fn(&Gaussians) -> Result<()>,
-    ) -> Result<(Gaussians, Fitted)> {
+    ) -> Result<(Gaussians, String)> {
         let fits = |model: &Gaussians| {
             write(model)?;
             Ok::<_, Error>(std::fs::metadata(path).is_ok_and(|file| file.len() <= most))
@@ -46,14 +37,13 @@ impl ExportOptions<'_> {
             level += 1;
             model = levels::level(gaussians, &[gaussians.count], self.division.cell(), level);
         }
-        for degree in (1..=all).rev() {
+        let mut degree = all;
+        loop {
             let fuller = model.with_sh_degree(degree);
-            if fits(&fuller)? {
-                return Ok((fuller, Fitted { level, degrees: [degree, all] }));
+            if fits(&fuller)? || degree == 0 {
+                return Ok((fuller, format!("; SH degree {degree} of {all}, level {level}")));
             }
+            degree -= 1;
         }
-        let bare = model.with_sh_degree(0);
-        write(&bare)?;
-        Ok((bare, Fitted { level, degrees: [0, all] }))
     }
 }

@@ -85,7 +85,6 @@ impl ExportOptions<'_> {
             text: self.text.unwrap_or_default().to_owned(),
             poster,
             poster_address: folder.zip(file).map(|(folder, file)| format!("{folder}/{file}")),
-            address: self.address.map(str::to_owned),
         }
     }
 
@@ -131,33 +130,24 @@ impl ExportOptions<'_> {
 
 /// Encodes the images once; as many bytes together as this at most, at smaller sizes.
 fn encode(bookmarks: &mut [Bookmark], most: Option<usize>) {
-    let mut pictures: Vec<&mut PageImage> = bookmarks
-        .iter_mut()
-        .flat_map(|bookmark| bookmark.pictures.iter_mut().map(|(_, picture)| picture))
-        .collect();
-    let encoded = |scale: f64, picture: &PageImage| match picture {
-        PageImage::Embedded(image) => {
-            let [width, height] =
-                [image.width, image.height].map(|side| (f64::from(side) * scale).round() as u32);
-            jpeg(&image.resized(width, height))
-        }
-        PageImage::At(address) => address.clone(),
-    };
-    let mut scale = 1.0_f64;
-    let images = loop {
-        let images: Vec<String> = pictures.iter().map(|picture| encoded(scale, picture)).collect();
-        let bytes = images.iter().map(String::len).sum::<usize>();
-        // The bytes of a JPEG fall more slowly than its pixels.
-        match most {
-            Some(most) if bytes > most && scale > 0.05 => {
-                scale *= 0.9 * (most as f64 / bytes as f64).sqrt();
+    let encoded = |scale: f64, bookmarks: &[Bookmark]| -> Vec<String> {
+        let scaled = |side: u32| (f64::from(side) * scale).round() as u32;
+        let encoded = |(_, picture): &(String, PageImage)| match picture {
+            PageImage::Embedded(image) => {
+                jpeg(&image.resized(scaled(image.width), scaled(image.height)))
             }
-            _ => break images,
-        }
+            PageImage::At(address) => address.clone(),
+        };
+        bookmarks.iter().flat_map(|bookmark| &bookmark.pictures).map(encoded).collect()
     };
-    for (picture, image) in pictures.iter_mut().zip(images) {
-        **picture = PageImage::At(image);
+    let (mut scale, mut images) = (1.0, encoded(1.0, bookmarks));
+    let bytes = |images: &[String]| images.iter().map(String::len).sum::<usize>();
+    while scale > 0.05 && most.is_some_and(|most| bytes(&images) > most) {
+        scale *= 0.75;
+        images = encoded(scale, bookmarks);
     }
+    let pictures = bookmarks.iter_mut().flat_map(|bookmark| &mut bookmark.pictures);
+    pictures.zip(images).for_each(|((_, picture), image)| *picture = PageImage::At(image));
 }
 
 /// What makes the targets of views that have a photograph and no reference image, where there are such views and a

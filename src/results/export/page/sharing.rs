@@ -23,12 +23,10 @@ pub struct Sharing {
     pub poster: Option<Image>,
     /// The address at which the poster will lie. Services that show a link read no picture from within a page.
     pub poster_address: Option<String>,
-    /// The address at which the page will lie.
-    pub address: Option<String>,
 }
 
 impl Sharing {
-    /// Policy, description and Open Graph tags of a page with this script and style; `asks`: whether it asks its server.
+    /// Policy, description and Open Graph tags of a page with this script and style, which asks its server or not.
     pub(super) fn head(&self, script: &str, style: &str, asks: bool) -> String {
         let hash = |text: &str| format!("'sha256-{}'", base64(&Sha256::digest(text)));
         let (script, style) = (hash(script), hash(style));
@@ -51,9 +49,6 @@ impl Sharing {
             tag("name", "description", &self.text);
             tag("property", "og:description", &self.text);
         }
-        if let Some(address) = &self.address {
-            tag("property", "og:url", address);
-        }
         if let Some(address) = &self.poster_address {
             tag("property", "og:image", address);
             tag("property", "og:image:alt", &self.title);
@@ -69,10 +64,9 @@ impl Sharing {
 
     /// The poster as an element of the page.
     pub(super) fn embedded(&self) -> String {
-        let uri =
-            |poster: &Image| jpeg_of_quality(&narrowed(poster, EMBEDDED_WIDTH), EMBEDDED_QUALITY);
-        let image = |poster| format!("<img id=\"poster\" src=\"{}\" alt=\"\">", uri(poster));
-        self.poster.as_ref().map(image).unwrap_or_default()
+        let Some(poster) = &self.poster else { return String::new() };
+        let uri = jpeg_of_quality(&narrowed(poster, EMBEDDED_WIDTH), EMBEDDED_QUALITY);
+        format!("<img id=\"poster\" src=\"{uri}\" alt=\"\">")
     }
 
     /// The poster as a JPEG file, for services that show links.
@@ -84,10 +78,9 @@ impl Sharing {
 
 /// The image, no wider than this.
 fn narrowed(image: &Image, most: u32) -> Image {
-    let (width, height) = (image.width, image.height);
-    if width <= most {
-        return image.clone();
-    }
-    let height = (u64::from(height) * u64::from(most) / u64::from(width)).max(1) as u32;
-    image.resized(most, height)
+    let width = image.width.min(most);
+    image.resized(
+        width,
+        (u64::from(image.height) * u64::from(width) / u64::from(image.width.max(1))) as u32,
+    )
 }

@@ -81,14 +81,6 @@ async function follow(show) {
   element('exportPage').addEventListener('click', async () => {
     download('model.html', new Blob([await sharedPage(source, buffer)], { type: 'text/html' }));
   });
-  element('modelFile').addEventListener('click', async () => {
-    try {
-      download('model.ply', await (await asked('model.ply')).blob());
-    } catch (error) {
-      say(hasEnded ? 'The file lies in the run.' : 'There is no checkpoint yet; save one.');
-      setTimeout(() => say(''), 4000);
-    }
-  });
 
   async function look() {
     const state = await (await asked('state')).json();
