@@ -462,6 +462,13 @@ def share(browser, page):
     is_right = sum(brighter) > 1.2 * sum(plain) and red / blue > 1.2 * plain[0] / plain[2]
     failed += report(is_right and browser.evaluate(MEAN) == plain, f"sliders: {colors}")
 
+    for count in (1, 2):
+        for kind in ("mousePressed", "mouseReleased"):
+            browser.call("Input.dispatchMouseEvent", type=kind, x=260, y=120, button="left", clickCount=count)
+    browser.settle()
+    apart = [abs(a - b) for a, b in zip(camera(browser), begin)]
+    failed += report(max(apart[:3]) < 1e-9 < 0.01 < max(apart[3:]), "a double click sets the centre")
+
     browser.evaluate("element('play').click()")
     time.sleep(1.5)
     playing, first = browser.evaluate("element('play').ariaPressed"), camera(browser)

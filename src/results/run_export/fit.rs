@@ -12,7 +12,7 @@ const LEAST_GAUSSIANS: usize = 100;
 
 impl ExportOptions<'_> {
     /// Writes the file again and again, until it has at most this many bytes; returns the model that it then has, and
-    /// what that is. Each level of detail is tried with all coefficients first: half of the Gaussians are a larger loss.
+    /// what that is. A level of detail is tried with all coefficients first: half of the Gaussians are a larger loss.
     pub(super) fn fit(
         &self,
         gaussians: &Gaussians,

@@ -89,7 +89,7 @@ function flight(stage, moves) {
 
 // The automatic path, round and round, from where the camera is.
 function player(stage) {
-  const { state } = stage, path = scene.path.map((viewFromWorld) => pose({ viewFromWorld }));
+  const { state, flown: path } = stage;
   const SECONDS = 24, BEGIN = 1.5;
   let along = 0, time = 0, from = null;
   const at = (t) => {
@@ -181,6 +181,7 @@ function pointing(stage, moves, edit, began) {
   }, { passive: false });
   // What is clicked twice becomes the centre.
   canvas.addEventListener('dblclick', (event) => {
+    if (element('tool').value) return;
     const point = stage.pointAt(...onCanvas(event));
     if (!point) { say('Nothing is there.'); return; }
     began();

@@ -66,7 +66,7 @@ async function sharedPage(source, buffer) {
   const packed = await new Response(new Blob([buffer]).stream().pipeThrough(new CompressionStream('gzip'))).blob();
   const model = (await asUri(packed)).replace(/^.*,/, '');
   const within = (page, id, text) =>
-    page.replace(new RegExp(`(<script id="${id}"[^>]*>)[^<]*`), (_, begin) => begin + text);
+    page.replace(new RegExp(`([<]script id="${id}"[^>]*>)[^<]*`), (_, begin) => begin + text);
   return within(within(source, 'scene', JSON.stringify(own).replaceAll('<', '\\u003c')), 'model', model);
 }
 

@@ -26,7 +26,9 @@ function look(edge) {
 function makeStage(gl) {
   const views = scene.views, poses = views.map(pose), home = center(poses);
   const { load, restrict, draw, sumsAt, layers } = renderer(gl, () => refresh());
-  const region = photographedRegion(scene.cameras.map(pose), home);
+  // The automatic path stays where the cameras are.
+  const flown = scene.path.map((viewFromWorld) => pose({ viewFromWorld }));
+  const region = photographedRegion([...scene.cameras.map(pose), ...flown], home);
   const state = { current: { ...poses[0] }, target: home, lens: views[0], bookmark: 0, last: 0 };
   // The share of the Gaussians that is drawn while the camera moves: as many as the device draws in time.
   let fraction = 1, moved = -Infinity, painted = 0, pending = false, fog = 0, isCoarse = false;
@@ -72,7 +74,7 @@ function makeStage(gl) {
     const ratio = (window.devicePixelRatio || 1) * (isCoarse ? 0.5 : 1);
     const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((v) => Math.max(1, Math.round(v * ratio)));
     // Before grey, what black hides is seen: holes.
-    const grey = element('grey').checked ? 0.5 : 0, layer = Number(element('layer').value);
+    const grey = element('grey').checked ? 0.5 : 0, layer = isShared() ? 0 : Number(element('layer').value);
     const edge = isLimited() && state.bookmark === null ? region.edge(state.current.eye) : 0;
     const isWhole = draw(camera(), width, height, {
       grey, layer, share: isMoving ? fraction : 1, reach: reach(), lamp: element('lamp').checked ? scene.lamp : null,
@@ -128,8 +130,8 @@ function makeStage(gl) {
     return { position: add(eye, scene.origin), rotation: quaternion(axes), fov: fov * 180 / Math.PI };
   };
   const stage = {
-    views, poses, home, region, state, layers, load, restrict, sumsAt, reach, refresh, hasMoved, animate, rest, free,
-    flyTo, projected, pointAt, keyframe, isLimited, painters, choose: () => {},
+    views, poses, home, flown, region, state, layers, load, restrict, sumsAt, reach, refresh, hasMoved, animate, rest,
+    free, flyTo, projected, pointAt, keyframe, isLimited, painters, choose: () => {},
   };
   return stage;
 }
