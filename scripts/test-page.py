@@ -378,6 +378,8 @@ def lamp(browser, run, folder, size):
 def live(browser, nightsplat, dataset, run):
     """A page of a training under way, and of its files."""
     failed = 0
+    # Software draws a large picture so slowly that a new model waits for it.
+    browser.resize(400, 300)
     train = ["train", dataset, "--out", run, "--steps", 100000, "--progress", "none", "--view", 0]
     with Serving(nightsplat, *train) as serving:
         if browser.open(serving.url) != "true":

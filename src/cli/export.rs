@@ -63,10 +63,9 @@ pub struct ExportArgs {
     pub text: Option<String>,
     /// For html: the address at which you publish the page
     ///
-    /// For html: the address at which you publish the page. The poster is then written beside the page, with the ending
-    /// jpg, for you to publish with it, and links to the page show it. Messengers and social networks fetch the
-    /// picture of a link from an address of its own: they read none from within a page, so without this option links
-    /// show title and text only.
+    /// The poster is then written beside the page, with the ending jpg, for you to publish with it, and links to the
+    /// page show it. Services that show links fetch a picture from its own address and read none from within a page (a
+    /// data URI): without this option they show title and text only.
     #[arg(long, value_name = "ADDRESS")]
     pub url: Option<String>,
     /// For html and --linear: dataset, if it moved since training [default: the run's]
@@ -79,7 +78,7 @@ pub struct ExportArgs {
 
 const EXAMPLES: &str = "Examples:
   nightsplat export run --format html             run/model.html: a viewer with photographs
-  nightsplat export run --format html --max-size 8M --title 'Our attic' --text 'By the light of one candle'
+  nightsplat export run --format html --max-size 8M --title 'Our attic'
   nightsplat export run --format spz --out a.spz  a tenth of the size, eight bits per number
   nightsplat export run --format glb              glTF with KHR_gaussian_splatting, at full precision
   nightsplat export run --format streamed-sog     run/model.streamed-sog: levels of detail, for large scenes";
