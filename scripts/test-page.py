@@ -52,7 +52,8 @@ COMPARE = """(async (png) => {
 # Key G from far away: before, after, and once the control has been clicked. The red of every pixel; alpha is ignored.
 GREY = """(async () => {
   const canvas = document.getElementById('canvas'), gl = canvas.getContext('webgl2');
-  const press = (key) => canvas.dispatchEvent(new KeyboardEvent('keydown', { key, bubbles: true }));
+  const send = (kind, key) =>
+    canvas.dispatchEvent(new KeyboardEvent(kind, { key, shiftKey: key === 's', bubbles: true }));
   const red = async () => {
     await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
     while (document.documentElement.dataset.settled !== 'true') await new Promise((done) => setTimeout(done, 20));
@@ -61,9 +62,11 @@ GREY = """(async () => {
     gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
     return [...pixels.filter((_, k) => k % 4 === 0)];
   };
-  for (let step = 0; step < 100; step++) press('s');
+  send('keydown', 's');
+  await new Promise((done) => setTimeout(done, 3000));
+  send('keyup', 's');
   const before = await red();
-  press('g');
+  send('keydown', 'g');
   const grey = await red(), isShown = document.getElementById('grey').checked;
   document.getElementById('grey').click();
   const after = await red(), added = grey.map((value, k) => value - before[k]);
@@ -158,10 +161,10 @@ class Browser:
             time.sleep(0.05)
         return time.monotonic() - begin
 
-    def open(self, url, view=0):
+    def open(self, url, view=0, face=""):
         """Opens the page and returns its state: `true` or `failed`."""
         self.call("Page.navigate", url="about:blank")
-        self.call("Page.navigate", url=f"{url}#view={view}")
+        self.call("Page.navigate", url=f"{url}#view={view}&{face}")
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             ready = self.evaluate("document.documentElement?.dataset.ready")
@@ -206,6 +209,17 @@ class Serving:
         self.process.wait()
 
 
+# The page that the live page offers for download.
+EXPORTED = """(async () => {
+  let blob = null;
+  const make = URL.createObjectURL;
+  URL.createObjectURL = (own) => { blob = own; return make.call(URL, own); };
+  document.getElementById('exportPage').click();
+  while (!blob) await new Promise((done) => setTimeout(done, 50));
+  URL.createObjectURL = make;
+  return blob.text();
+})()"""
+
 # Red, green and blue of the whole canvas.
 MEAN = """(() => {
   const canvas = document.getElementById('canvas'), gl = canvas.getContext('webgl2');
@@ -225,7 +239,7 @@ def select(browser, control, value, event="change"):
     browser.evaluate(f"""(() => {{
       const control = document.getElementById('{control}');
       if (control.type === 'checkbox') control.checked = {json.dumps(value)}; else control.value = {json.dumps(value)};
-      control.dispatchEvent(new Event('{event}'));
+      control.dispatchEvent(new Event('{event}', {{ bubbles: true }}));
     }})()""")
     browser.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done())))")
     browser.settle()
@@ -277,6 +291,23 @@ def psnr(browser, picture):
     return browser.evaluate(COMPARE.replace("PNG", png))
 
 
+def hold(browser, *keys, seconds=0.0):
+    """Presses keys of the keyboard together, and waits until the camera is still."""
+    for kind in ("keyDown", "keyUp"):
+        for key in keys:
+            text = key if len(key) == 1 and kind == "keyDown" else ""
+            browser.call("Input.dispatchKeyEvent", type=kind, key=key, text=text)
+        if kind == "keyDown":
+            time.sleep(seconds)
+    browser.settle()
+
+
+def camera(browser):
+    """Where the camera is: position and rotation."""
+    found = browser.evaluate("nightsplat.camera()")
+    return found["position"] + found["rotation"]
+
+
 def drag(browser, *places):
     """Drags the mouse between places on the canvas, as shares of its size."""
     box = browser.evaluate(BOX)
@@ -290,7 +321,7 @@ def drag(browser, *places):
 
 def edits(browser, run, page, folder, size):
     """What is edited in the page is what `edit` makes of the saved list; a saved keyframe is what `render` shows."""
-    browser.open(page.as_uri())
+    browser.open(page.as_uri(), face="inspect")
     browser.fit_canvas(*size)
     before = browser.evaluate(MEAN)
     select(browser, "tool", "brush", "input")
@@ -308,8 +339,7 @@ def edits(browser, run, page, folder, size):
     run("render", edited, "--dataset", folder / f"set-{SIZES[0][0]}", "--split", "test", "--out", folder / "edited")
     of_view = psnr(browser, sorted((folder / "edited").rglob("*.png"))[0])
     # A free camera has a centred lens, as frames of a path have.
-    browser.evaluate("document.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowLeft', bubbles: true }))")
-    browser.settle()
+    hold(browser, "ArrowLeft")
     browser.evaluate("document.getElementById('keyframe').click()")
     browser.settle()
     (folder / "path.json").write_text(browser.evaluate("JSON.stringify(nightsplat.path())"))
@@ -348,6 +378,8 @@ def lamp(browser, run, folder, size):
 def live(browser, nightsplat, dataset, run):
     """A page of a training under way, and of its files."""
     failed = 0
+    # Software draws a large picture so slowly that a new model waits for it.
+    browser.resize(400, 300)
     train = ["train", dataset, "--out", run, "--steps", 100000, "--progress", "none", "--view", 0]
     with Serving(nightsplat, *train) as serving:
         if browser.open(serving.url) != "true":
@@ -371,13 +403,158 @@ def live(browser, nightsplat, dataset, run):
                 time.sleep(0.02)
             seconds = browser.wait(f"Number(document.documentElement.dataset.version) > {shown}")
         browser.open(serving.url)
+        exported = browser.evaluate(EXPORTED)
+        (run / "exported.html").write_text(exported)
         browser.evaluate("document.getElementById('stop').click()")
         code = serving.process.wait(PATIENCE)
-        browser.wait("document.getElementById('progress').textContent.includes('has ended')")
-    is_right = seconds <= 2.0 and code == 130 and "of at most 100000" in line
-    print(f"{'ok' if is_right else 'BAD':3} live: a checkpoint is shown after {seconds:.2f} s; code {code}; {line}")
-    failed += not is_right
+        browser.wait("document.getElementById('progress').textContent.startsWith('stopped at step')")
+        end = browser.evaluate("document.getElementById('progress').textContent")
+    is_right = seconds <= 2.0 and code == 130 and "of at most 100000" in line and ", saved" in end
+    failed += report(is_right, f"live: a checkpoint is shown after {seconds:.2f} s; code {code}; {line}; {end}")
+    ready = browser.open((run / "exported.html").as_uri())
+    is_right = ready == "true" and browser.evaluate("root.dataset.face === 'share' && !element('divider').hidden")
+    return failed + report(is_right, f"the page that the live page exports: {len(exported) >> 10} KiB, {ready}")
+
+
+def report(is_right, line):
+    print(f"{'ok' if is_right else 'BAD':3} {line}")
+    return not is_right
+
+
+def center_of(browser, control):
+    """The middle of a control on the page."""
+    x, y, width, height = browser.evaluate(BOX.replace("canvas", f"element('{control}')"))
+    return x + width / 2, y + height / 2
+
+
+def press(browser, x, y, to=None):
+    """Presses the mouse at a place of the page, and releases it there or elsewhere."""
+    for kind, (left, top) in (("mousePressed", (x, y)), ("mouseMoved", to or (x, y)), ("mouseReleased", to or (x, y))):
+        buttons = 0 if kind == "mouseReleased" else 1
+        browser.call("Input.dispatchMouseEvent", type=kind, x=left, y=top, button="left", buttons=buttons, clickCount=1)
+
+
+def share(browser, page):
+    """The shared face: keys after every control, sliders, flight, the limits of the camera, and both faces."""
+    failed = 0
+    browser.open(page.as_uri())
+    browser.resize(400, 300)
+    browser.settle()
+    begin, x = camera(browser), center_of(browser, "divider")[0]
+    press(browser, *center_of(browser, "divider"), to=(x + 100, 150))
+    moved = center_of(browser, "divider")[0] - x
+    hold(browser, "w", seconds=0.3)
+    after_divider = camera(browser)
+    press(browser, *center_of(browser, "brightness"))
+    hold(browser, "ArrowLeft", seconds=0.3)
+    is_right = abs(moved - 100) < 2 and after_divider != begin and camera(browser) != after_divider
+    failed += report(is_right, f"keys after the divider, which moved by {moved:.0f} pixels, and after a slider")
+
+    hold(browser, "r")
+    one = [hold(browser, *keys, seconds=0.4) or camera(browser)[:3] for keys in (["d"], ["d", "e"])]
+    hold(browser, "r")
+    failed += report(one[0] != one[1] and camera(browser) == begin, "keys fly, two together, and R returns")
+
+    colors = {}
+    for name, slider, value in (("plain", "warmth", "0"), ("brighter", "brightness", "1"), ("warmer", "warmth", "0.4")):
+        select(browser, slider, value, "input")
+        colors[name] = browser.evaluate(MEAN)
+        select(browser, slider, "0", "input")
+    plain, brighter, (red, _, blue) = colors.values()
+    is_right = sum(brighter) > 1.2 * sum(plain) and red / blue > 1.2 * plain[0] / plain[2]
+    failed += report(is_right and browser.evaluate(MEAN) == plain, f"sliders: {colors}")
+
+    for count in (1, 2):
+        for kind in ("mousePressed", "mouseReleased"):
+            browser.call("Input.dispatchMouseEvent", type=kind, x=260, y=120, button="left", clickCount=count)
+    browser.settle()
+    apart = [abs(a - b) for a, b in zip(camera(browser), begin)]
+    failed += report(max(apart[:3]) < 1e-9 < 0.01 < max(apart[3:]), "a double click sets the centre")
+
+    browser.evaluate("element('play').click()")
+    time.sleep(1.5)
+    playing, first = browser.evaluate("element('play').ariaPressed"), camera(browser)
+    time.sleep(0.5)
+    second = camera(browser)
+    hold(browser, "p")
+    failed += report(playing == "true" and begin != first != second, "play moves the camera, and P ends it")
+
+    hold(browser, "r")
+    hold(browser, "s", seconds=6)
+    away = browser.evaluate("""(() => {
+      const { position } = nightsplat.camera(), eyes = scene.cameras.map((own) => add(pose(own).eye, scene.origin));
+      const apart = eyes.map((eye) => distance(eye, position)), across = eyes.map((eye) => distance(eye, eyes[0]));
+      return Math.min(...apart) / Math.max(...across);
+    })()""")
+    failed += report(away < 1.0, f"the camera stays near the photographs: {away:.2f} of their extent away")
+
+    hold(browser, "i")
+    beside = browser.evaluate("""(() => {
+      const a = canvas.getBoundingClientRect(), b = element('panel').getBoundingClientRect();
+      return b.width > 0 && (b.left >= a.right || b.top >= a.bottom) && element('bar').hidden;
+    })()""")
+    hold(browser, "i")
+    is_right = beside and browser.evaluate("element('panel').hidden && canvas.clientWidth === innerWidth")
+    return failed + report(is_right, "I opens the panel beside the picture, and closes it")
+
+
+def phone(browser, page):
+    """On a phone nothing is cut off, in both faces, and every control has a name."""
+    failed = 0
+    for face in ("share", "inspect"):
+        browser.open(page.as_uri(), face=face)
+        browser.resize(360, 640)
+        found = browser.evaluate("""(() => {
+          const all = [...document.querySelectorAll('button, input, select, [tabindex]')];
+          const controls = all.filter((own) => own.checkVisibility());
+          const name = (own) => own.ariaLabel || own.textContent.trim() || own.labels?.[0]?.textContent.trim();
+          return {
+            cut: controls.filter((own) => {
+              const { left, right } = own.getBoundingClientRect();
+              return left < -14 || right > innerWidth + 14;
+            }).map((own) => own.id),
+            unnamed: controls.filter((own) => !name(own)).map((own) => own.id),
+            overflow: document.documentElement.scrollWidth - innerWidth, count: controls.length,
+            canvas: canvas.clientHeight / innerHeight,
+          };
+        })()""")
+        is_right = not found["cut"] and not found["unnamed"] and found["overflow"] <= 0 and found["count"] > 6
+        failed += report(is_right and found["canvas"] > 0.5, f"360 pixels wide, {face}: {found}")
     return failed
+
+
+def tags(browser, run, folder):
+    """Title, text, tags and poster of an export, its policy, and its size."""
+    page, title = folder / "shared.html", 'The "attic" <1>'
+    options = ["--title", title, "--text", "By one candle", "--url", "https://example.org/rooms/", "--max-size", "180K"]
+    run("export", folder / "run", "--format", "html", "--views", 1, "--out", page, *options)
+    ready = browser.open(page.as_uri())
+    found = browser.evaluate("""Object.fromEntries([...document.querySelectorAll('meta[property], meta[name]')]
+      .map((own) => [own.getAttribute('property') ?? own.name, own.content]))""")
+    policy = browser.evaluate("document.querySelector('meta[http-equiv]').content")
+    poster = page.with_suffix(".jpg")
+    is_right = ready == "true" and browser.evaluate("document.title") == title
+    is_right = is_right and (found["og:title"], found["og:description"]) == (title, "By one candle")
+    is_right = is_right and found["og:image"] == "https://example.org/rooms/shared.jpg"
+    is_right = is_right and poster.read_bytes()[:2] == b"\xff\xd8" and "unsafe" not in policy and "'none'" in policy
+    kib = page.stat().st_size / 1024
+    return report(is_right and kib <= 180, f"title and tags: {found}; {kib:.0f} KiB of 180")
+
+
+def cameras_of_a_dataset(browser, nightsplat, dataset):
+    """`view DATASET` shows the cameras; a click on one goes there."""
+    with Serving(nightsplat, "view", dataset, "--listen", 0) as serving:
+        ready = browser.open(serving.url)
+        browser.resize(800, 600)
+        hold(browser, "s", seconds=1.0)
+        at = browser.evaluate("""(() => {
+          const { data } = element('frusta').getContext('2d').getImageData(0, 0, 400, 400);
+          const drawn = data.filter((value, k) => k % 4 === 3 && value > 0).length;
+          return { drawn, colors: element('canvas').width };
+        })()""")
+        mean = browser.evaluate(MEAN)
+        is_right = ready == "true" and at["drawn"] > 200 and max(mean) > min(mean)
+        return report(is_right, f"cameras of a dataset: {at}, points {mean}")
 
 
 def nightsplat_of_this_tree():
@@ -419,18 +596,23 @@ def main():
                     failed += found < ENOUGH
                 if not pictures:
                     raise RuntimeError(f"no renders in {renders}")
+            browser.open(page.as_uri(), len(pictures) - 1, "inspect")
+            browser.fit_canvas(*SIZES[-1])
             seen = browser.evaluate(GREY)
             # Half floats round by one level.
             is_grey = seen["isShown"] and seen["empty"] in (127, 128) and seen["least"] >= -1 and seen["most"] <= 129
             is_grey = is_grey and seen["opaque"] > 0 and seen["changed"] == 0
             print(f"{'ok' if is_grey else 'BAD':3} before grey: {seen}")
             failed += not is_grey
-            browser.open(page.as_uri())
+            browser.open(page.as_uri(), face="inspect")
             failed += not layers(browser)
             failed += not touch(browser)
             failed += lamp(browser, run, folder, SIZES[0])
-            browser.open(page.as_uri())
             failed += not edits(browser, run, page, folder, SIZES[0])
+            failed += share(browser, page)
+            failed += phone(browser, page)
+            failed += tags(browser, run, folder)
+            failed += cameras_of_a_dataset(browser, nightsplat, trained)
             failed += bool(browser.complaints)
             print(f"{'BAD' if browser.complaints else 'ok':3} console: {browser.complaints or 'nothing'}")
             failed += live(browser, nightsplat, trained, folder / "live")

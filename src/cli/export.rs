@@ -14,6 +14,7 @@ use crate::results::export::{Format, spz};
 use crate::results::finished_run::is_model;
 use crate::results::run_export::up::{Turn, Up};
 use crate::results::run_export::{ExportOptions, Exported};
+use crate::train::CacheSize;
 
 /// Write a run's model in the format of a viewer, as bright as it was trained to be.
 #[derive(Clone, Debug, clap::Args)]
@@ -47,9 +48,26 @@ pub struct ExportArgs {
     /// For streamed-sog: the most Gaussians of a chunk; levels of detail are made in cells of a quarter of it
     #[arg(long, value_name = "N", default_value_t = Division::default().chunk)]
     pub chunk: usize,
+    /// The largest file, such as 8M: coefficients of colours are left out, then levels of detail, until it fits; in
+    /// html, photographs shrink. For html, spz, glb and sog
+    #[arg(long, value_name = "SIZE")]
+    pub max_size: Option<CacheSize>,
     /// For html: number of views to start from, with photographs
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub views: usize,
+    /// For html: the title of the page and of links to it [default: the dataset's name]
+    #[arg(long, value_name = "TITLE")]
+    pub title: Option<String>,
+    /// For html: a sentence below the title, and below that of links
+    #[arg(long, value_name = "TEXT")]
+    pub text: Option<String>,
+    /// For html: the address at which you publish the page
+    ///
+    /// The poster is then written beside the page, with the ending jpg, for you to publish with it, and links to the
+    /// page show it. Services that show links fetch a picture from its own address and read none from within a page (a
+    /// data URI): without this option they show title and text only.
+    #[arg(long, value_name = "ADDRESS")]
+    pub url: Option<String>,
     /// For html and --linear: dataset, if it moved since training [default: the run's]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
@@ -60,6 +78,7 @@ pub struct ExportArgs {
 
 const EXAMPLES: &str = "Examples:
   nightsplat export run --format html             run/model.html: a viewer with photographs
+  nightsplat export run --format html --max-size 8M --title 'Our attic'
   nightsplat export run --format spz --out a.spz  a tenth of the size, eight bits per number
   nightsplat export run --format glb              glTF with KHR_gaussian_splatting, at full precision
   nightsplat export run --format streamed-sog     run/model.streamed-sog: levels of detail, for large scenes";
@@ -85,6 +104,7 @@ pub(super) fn write(args: &ExportArgs) -> crate::Result<Exported> {
     check_ending(args)?;
     check_levels(args)?;
     check_linear(args)?;
+    check_page(args)?;
     let options = ExportOptions {
         source: &args.run,
         format: match args.format {
@@ -96,7 +116,11 @@ pub(super) fn write(args: &ExportArgs) -> crate::Result<Exported> {
         linear: args.linear,
         level: args.level,
         division: Division { levels: args.levels, chunk: args.chunk },
+        max_size: args.max_size.map(|CacheSize(bytes)| bytes),
         views: args.views,
+        title: args.title.as_deref(),
+        text: args.text.as_deref(),
+        address: args.url.as_deref(),
         dataset: args.dataset.as_deref(),
         opener: opener(args.device.as_ref()),
     };
@@ -104,7 +128,8 @@ pub(super) fn write(args: &ExportArgs) -> crate::Result<Exported> {
 }
 
 /// A line on the contents of the file.
-fn line(source: &Path, Exported { path, count, streamed, origin, turn }: &Exported) -> String {
+fn line(source: &Path, exported: &Exported) -> String {
+    let Exported { path, count, fitted, streamed, origin, turn } = exported;
     let turn = turn.as_ref().map(|Turn { angle, up, axis, .. }| {
         let [x, y, z] = up.to_array().map(|part| format!("{:.3}", part + 0.0));
         let angle = angle.to_degrees();
@@ -121,7 +146,7 @@ fn line(source: &Path, Exported { path, count, streamed, origin, turn }: &Export
     }
     let brightness = if is_model(source) { "" } else { ", as bright as their targets" };
     let relative = relative_to(*origin).map(|line| format!("; {line}")).unwrap_or_default();
-    format!("{shown}: {count} Gaussians in {kib} KiB{brightness}{turn}{relative}")
+    format!("{shown}: {count} Gaussians in {kib} KiB{brightness}{fitted}{turn}{relative}")
 }
 
 /// The bytes of a file, or of the files in a folder.
@@ -172,6 +197,22 @@ fn check_levels(args: &ExportArgs) -> crate::Result<()> {
         _ => return Ok(()),
     };
     Err(Error::Usage(problem))
+}
+
+/// Refuses what only pages have, and a size of what has a layout of its own.
+fn check_page(args: &ExportArgs) -> crate::Result<()> {
+    let is_sized = !matches!(args.format, Format::Ply | Format::StreamedSog);
+    let has_page_options = args.title.is_some() || args.text.is_some() || args.url.is_some();
+    let problem = if args.max_size.is_some() && !is_sized {
+        "--max-size is of --format html, spz, glb and sog; pass --level for another"
+    } else if has_page_options && args.format != Format::Html {
+        "--title, --text and --url are of --format html"
+    } else if args.url.as_ref().is_some_and(|url| !url.starts_with("http")) {
+        "--url is an address such as https://example.org/room/"
+    } else {
+        return Ok(());
+    };
+    Err(Error::Usage(problem.to_owned()))
 }
 
 /// Refuses linear light for formats of eight bits, which would show banding, and for model files, whose tone curve is

@@ -14,6 +14,7 @@ pub(crate) use self::options::TrainOptions;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
 use super::{finish, phases, print, signals, tell, view, word};
+use crate::Error;
 use crate::driver;
 use crate::gpu::DeviceChoice;
 use crate::live;
@@ -142,7 +143,11 @@ pub fn run(args: &TrainArgs) -> Result<()> {
             site.feed.observe(event);
         }
     };
-    let done = run::train_in(&gpu, &config, &dataset, &args.out, &session, observe)?;
+    let done = run::train_in(&gpu, &config, &dataset, &args.out, &session, observe);
+    if let Some((site, _)) = &page {
+        site.feed.end(&ended_on_page(args, &done));
+    }
+    let done = done?;
     let RunSummary { trainer, ended, evaluation, spent, .. } = done;
     phases::log();
     if !is_text {
@@ -168,6 +173,19 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let run = args.out.display();
     finish(&format!("{run}/model.ply, {run}/metrics.json"), &next(args));
     Ok(())
+}
+
+/// How the run ended, as its page says it.
+fn ended_on_page<T>(args: &TrainArgs, done: &crate::Result<T>) -> String {
+    let run = word(&args.out);
+    match done {
+        Ok(_) => format!("finished, saved; next: nightsplat export {run} --format html"),
+        Err(Error::Stopped { step, .. }) => format!(
+            "stopped at step {step}, saved; go on with the same command and --resume, or export it: nightsplat export \
+             {run} --format html"
+        ),
+        Err(error) => format!("ended: {error}"),
+    }
 }
 
 /// The command to run after training.

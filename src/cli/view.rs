@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 use anyhow::Result;
-use glam::{DAffine3, DVec3, Vec3};
+use glam::{DAffine3, DVec2, DVec3, Vec3};
 use nightsplat_core::camera::Camera;
 use nightsplat_photographs::dataset::Dataset;
 
@@ -13,7 +13,7 @@ use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::live::{DEFAULT_ADDRESS, Feed, Listen, Pictures, Server, Site};
 use crate::results::export::Provenance;
-use crate::results::export::page::{Bookmark, ModelPage};
+use crate::results::export::page::{Bookmark, ModelPage, Sharing};
 use crate::results::finished_run::{config_of_file, is_model};
 use crate::results::run::{self, Requests};
 use crate::splats::render::RenderSettings;
@@ -119,15 +119,20 @@ fn of_dataset(
     pictures: Pictures,
     facts: &ModelFacts,
 ) -> Result<Arc<Site>> {
-    let (bookmarks, up) = (pictures.bookmarks(), pictures.dataset().up());
     let dataset = pictures.dataset().root.file_name().unwrap_or_default();
     let provenance = Provenance {
         dataset: dataset.to_string_lossy().into_owned(),
         facts: *facts,
         ..Default::default()
     };
-    let origin = pictures.origin();
-    page(path, feed, Some(pictures), bookmarks, up, provenance, origin)
+    let page = ModelPage {
+        bookmarks: pictures.bookmarks(),
+        shows_cameras: feed.is_fixed(),
+        origin: pictures.origin(),
+        up: pictures.dataset().up(),
+        ..page(path, provenance)
+    };
+    site(page, feed, Some(pictures))
 }
 
 /// The page of a model alone, which is seen from outside, with -y up.
@@ -140,23 +145,31 @@ fn of_model(
     let bookmark =
         Bookmark { name: "overview".to_owned(), camera: overview(gaussians), pictures: vec![] };
     let provenance = Provenance { facts: *facts, ..Provenance::default() };
-    page(path, feed, None, vec![bookmark], DVec3::NEG_Y, provenance, gaussians.origin)
+    let page =
+        ModelPage { bookmarks: vec![bookmark], origin: gaussians.origin, ..page(path, provenance) };
+    site(page, feed, None)
 }
 
-fn page(
-    path: &Path,
-    feed: Feed,
-    pictures: Option<Pictures>,
-    bookmarks: Vec<Bookmark>,
-    up: DVec3,
-    provenance: Provenance,
-    origin: DVec3,
-) -> Result<Arc<Site>> {
-    let title = path.display().to_string();
+/// A page without views.
+fn page(path: &Path, provenance: Provenance) -> ModelPage<'static> {
     let near = provenance.facts.near.unwrap_or_else(|| RenderSettings::default().near).into();
-    let (gaussians, fingerprint, lamp) = (None, None, None);
-    let page =
-        ModelPage { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up, lamp };
+    ModelPage {
+        sharing: Sharing { title: path.display().to_string(), ..Sharing::default() },
+        gaussians: None,
+        provenance,
+        bookmarks: vec![],
+        cameras: vec![],
+        shows_cameras: false,
+        origin: DVec3::ZERO,
+        fingerprint: None,
+        near,
+        up: DVec3::NEG_Y,
+        lamp: None,
+    }
+}
+
+fn site(mut page: ModelPage<'_>, feed: Feed, pictures: Option<Pictures>) -> Result<Arc<Site>> {
+    page.cameras = page.bookmarks.iter().map(|bookmark| bookmark.camera).collect();
     let html = page.html()?;
     Ok(Arc::new(Site { html: html.into(), feed, pictures: pictures.map(Mutex::new) }))
 }
@@ -177,20 +190,48 @@ fn overview(gaussians: &Gaussians) -> Camera {
     Camera::perspective(DAffine3::from_translation(-eye), FOV, SIZE)
 }
 
-/// The points of a dataset, in grey.
+/// The points of a dataset, in the colours of photographs, as bright as is seen well.
 fn points(dataset: &Dataset) -> crate::Result<Gaussians> {
-    const GREY: Vec3 = Vec3::splat(0.6);
+    /// Standard deviation of a point, relative to the distance of the cameras.
+    const SIZE: f64 = 0.003;
     let origin = dataset.frame().file_origin();
     let positions: Vec<DVec3> =
         dataset.points.iter().map(|point| point.position - origin).collect();
-    let start = Initialization { opacity: 0.9, scale: 0.3, ..Initialization::default() };
-    let mut gaussians = Gaussians::from_points(
-        &positions,
-        &vec![GREY; positions.len()],
-        Shape::default(),
-        &start,
-        0,
-    )?;
+    let (colors, start) = (point_colors(dataset), Initialization::default());
+    let start = Initialization { opacity: 0.9, ..start };
+    let mut gaussians = Gaussians::from_points(&positions, &colors, Shape::default(), &start, 0)?;
+    let eye = dataset.views.first().map_or(origin, |view| view.camera.center()) - origin;
+    let mut distances: Vec<f64> = positions.iter().map(|point| eye.distance(*point)).collect();
+    distances.sort_by(f64::total_cmp);
+    let distance = distances.get(distances.len() / 2).copied().unwrap_or(1.0).max(1e-6);
+    gaussians.log_scales_mut().fill(Vec3::splat((SIZE * distance).ln() as f32));
     gaussians.origin = origin;
     Ok(gaussians)
+}
+
+/// The colour of every point in the first photograph that shows it, all brightened alike; grey without one.
+fn point_colors(dataset: &Dataset) -> Vec<Vec3> {
+    const GREY: Vec3 = Vec3::splat(0.6);
+    /// The most photographs that are decoded.
+    const PHOTOGRAPHS: usize = 24;
+    /// What the brightest twentieth becomes.
+    const BRIGHT: f32 = 0.85;
+    let mut colors: Vec<Option<Vec3>> = vec![None; dataset.points.len()];
+    let every = dataset.views.len().div_ceil(PHOTOGRAPHS).max(1);
+    for (index, view) in dataset.views.iter().enumerate().step_by(every) {
+        let Ok(Some(photograph)) = view.loaded() else { continue };
+        let size = DVec2::new(photograph.width.into(), photograph.height.into());
+        for (point, color) in dataset.points.iter().zip(&mut colors) {
+            let is_seen = point.views.is_empty() || point.views.contains(&(index as u32));
+            let pixel = view.camera.project(point.position).filter(|_| is_seen && color.is_none());
+            if let Some(at) = pixel.filter(|at| at.min_element() >= 0.0 && at.cmplt(size).all()) {
+                *color = Some(Vec3::from(photograph.pixel(at.x as u32, at.y as u32)));
+            }
+        }
+    }
+    let mut brightness: Vec<f32> = colors.iter().flatten().map(|c| c.max_element()).collect();
+    brightness.sort_by(f32::total_cmp);
+    let bright = brightness.get(brightness.len() * 19 / 20).copied().unwrap_or(BRIGHT).max(1e-3);
+    let shown = |color: Vec3| (color * (BRIGHT / bright)).clamp(Vec3::ZERO, Vec3::ONE);
+    colors.into_iter().map(|color| color.map_or(GREY, shown)).collect()
 }

@@ -25,6 +25,8 @@ const SNAPSHOT_EVERY: Duration = Duration::from_secs(1);
 const SNAPSHOT_SHARE: f64 = 0.04;
 /// Progress is read from files at most this often, however many pages ask.
 const STATE_EVERY: Duration = Duration::from_millis(250);
+/// A page that has not asked for so long is closed, or hidden; others ask once a second.
+const WATCHED_WITHIN: Duration = Duration::from_secs(2);
 
 /// What is shown.
 #[derive(Debug)]
@@ -58,8 +60,12 @@ struct FeedState {
     fingerprint: Option<String>,
     /// Why the newest model cannot be shown, on one line.
     problem: Option<String>,
+    /// How the training in this process ended.
+    ended: Option<String>,
     /// When the next snapshot may be requested.
     next: Option<Instant>,
+    /// When a page last asked.
+    asked: Option<Instant>,
     /// The last answer.
     told: Option<(Instant, Value)>,
 }
@@ -86,6 +92,23 @@ impl Feed {
         let mut state = FeedState::new(FeedSource::Fixed);
         state.show(gaussians, None);
         Self { requests: None, state: Mutex::new(state) }
+    }
+
+    /// Whether the model never changes.
+    pub(crate) fn is_fixed(&self) -> bool {
+        matches!(self.lock().source, FeedSource::Fixed)
+    }
+
+    /// Takes how the training in this process ended, on one line, and gives a page that is open the time to ask for it.
+    pub(crate) fn end(&self, ended: &str) {
+        let is_watched = {
+            let mut state = self.lock();
+            (state.told, state.ended) = (None, Some(ended.to_owned()));
+            state.asked.is_some_and(|at| at.elapsed() < WATCHED_WITHIN)
+        };
+        if is_watched {
+            std::thread::sleep(WATCHED_WITHIN);
+        }
     }
 
     /// Takes what the training in this process reports.
@@ -123,6 +146,7 @@ impl Feed {
     /// is asked for a snapshot.
     pub(super) fn state(&self) -> Value {
         let mut state = self.lock();
+        state.asked = Some(Instant::now());
         if let Some((_, answer)) = state.told.as_ref().filter(|(at, _)| at.elapsed() < STATE_EVERY)
         {
             return answer.clone();
@@ -149,6 +173,9 @@ impl Feed {
         told["fingerprint"] = state.fingerprint.clone().into();
         told["canControl"] = self.requests.is_some().into();
         told["problem"] = state.problem.clone().into();
+        if state.ended.is_some() {
+            (told["endedBy"], told["canControl"]) = (state.ended.clone().into(), false.into());
+        }
         state.told = Some((now, told.clone()));
         told
     }
@@ -168,7 +195,9 @@ impl FeedState {
             file: None,
             fingerprint: None,
             problem: None,
+            ended: None,
             next: None,
+            asked: None,
             told: None,
         }
     }

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use nightsplat_photographs::image::Image;
 
 pub use self::chart::{Chart, Mark, Series, VerticalLine};
-pub(crate) use self::data_uri::{base64, jpeg};
+pub(crate) use self::data_uri::{base64, jpeg, jpeg_of_quality};
 pub use self::distribution::{Distribution, distributions};
 pub use self::table::{Best, Column, NumberTable};
 

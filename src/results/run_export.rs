@@ -1,5 +1,6 @@
 //! The export of a run or of a model file.
 
+mod fit;
 mod page;
 pub(crate) mod up;
 
@@ -13,6 +14,8 @@ use nightsplat_photographs::scene_tone::SceneTone;
 
 use self::up::Turn;
 pub use self::up::Up;
+use crate::results::edit::fingerprint;
+use crate::results::export::page::ModelPage;
 use crate::results::export::streamed::{self, Division, TileLoader, Written};
 use crate::results::export::{Format, Provenance};
 use crate::results::finished_run::{Opener, config_of_file, is_model, needs_photographs};
@@ -39,8 +42,14 @@ pub(crate) struct ExportOptions<'a> {
     /// The level of detail.
     pub(crate) level: usize,
     pub(crate) division: Division,
+    /// The most bytes of the file.
+    pub(crate) max_size: Option<u64>,
     /// The number of views of a page.
     pub(crate) views: usize,
+    /// The title of a page, the text below it, and the address at which it will lie.
+    pub(crate) title: Option<&'a str>,
+    pub(crate) text: Option<&'a str>,
+    pub(crate) address: Option<&'a str>,
     /// `None`: the run's.
     pub(crate) dataset: Option<&'a Path>,
     pub(crate) opener: Opener,
@@ -52,6 +61,8 @@ pub(crate) struct Exported {
     pub(crate) path: PathBuf,
     /// The number of Gaussians of the finest level.
     pub(crate) count: usize,
+    /// What a limited size left of the model; empty without a limit.
+    pub(crate) fitted: String,
     /// The levels of a streamed model.
     pub(crate) streamed: Option<Written>,
     /// The position in the world that those of the file are relative to.
@@ -89,7 +100,7 @@ impl ExportOptions<'_> {
         let path = self.path()?;
         let written = streamed::write(&path, &tiles, &provenance, self.division)?;
         let (count, origin) = (written.counts[0], DVec3::ZERO);
-        Ok(Exported { path, count, streamed: Some(written), origin, turn })
+        Ok(Exported { path, count, fitted: String::new(), streamed: Some(written), origin, turn })
     }
 
     fn write_whole(&self, joined: Option<&TileManifest>) -> Result<Exported> {
@@ -120,26 +131,57 @@ impl ExportOptions<'_> {
             gaussians = levels::level(&gaussians, &tiles, self.division.cell(), self.level);
         }
         let provenance = Provenance { rotation, facts, ..self.provenance(&config) };
-        let mut streamed = None;
         create_folder_of(&path)?;
-        match self.format {
-            // Viewers with a fixed layout expect the coefficients of degree 3.
-            Format::Ply => {
-                let padded = gaussians.with_sh_degree(MAX_SH_DEGREE);
-                Format::Ply.write(&padded, &provenance, &path)?;
-            }
-            Format::StreamedSog => {
-                let tile = TileLoader::whole(self.source, &gaussians);
-                streamed = Some(streamed::write(&path, &[tile], &provenance, self.division)?);
-            }
-            Format::Html => {
-                let page = self.page(&config, &gaussians, provenance)?;
-                write_whole(&path, page.as_bytes())?;
-            }
-            format => format.write(&gaussians, &provenance, &path)?,
+        let page = match self.format {
+            Format::Html => Some(self.page(&config, gaussians.origin, provenance.clone())?),
+            _ => None,
+        };
+        let write = |model: &Gaussians| self.write_file(model, &provenance, page.as_ref(), &path);
+        let (mut fitted, mut streamed) = (String::new(), None);
+        if let Some(most) = self.max_size {
+            let write = |model: &Gaussians| write(model).map(drop);
+            (gaussians, fitted) = self.fit(&gaussians, &path, most, write)?;
+        } else {
+            streamed = write(&gaussians)?;
+        }
+        let poster = page.as_ref().map(|page| page.sharing.poster_file()).transpose()?.flatten();
+        if let Some((path, poster)) = self.poster_path().zip(poster) {
+            write_whole(&path, &poster)?;
         }
         let (count, origin) = (gaussians.count, gaussians.origin);
-        Ok(Exported { path, count, streamed, origin, turn })
+        Ok(Exported { path, count, fitted, streamed, origin, turn })
+    }
+
+    fn write_file(
+        &self,
+        gaussians: &Gaussians,
+        provenance: &Provenance,
+        page: Option<&ModelPage<'_>>,
+        path: &Path,
+    ) -> Result<Option<Written>> {
+        match (self.format, page) {
+            // Viewers with a fixed layout expect the coefficients of degree 3.
+            (Format::Ply, _) => {
+                Format::Ply.write(&gaussians.with_sh_degree(MAX_SH_DEGREE), provenance, path)?;
+            }
+            (Format::StreamedSog, _) => {
+                let tile = TileLoader::whole(self.source, gaussians);
+                return streamed::write(path, &[tile], provenance, self.division).map(Some);
+            }
+            (Format::Html, Some(page)) => {
+                let fingerprint = Some(fingerprint(gaussians));
+                let page = ModelPage { gaussians: Some(gaussians), fingerprint, ..page.clone() };
+                write_whole(path, page.html()?.as_bytes())?;
+            }
+            (format, _) => format.write(gaussians, provenance, path)?,
+        }
+        Ok(None)
+    }
+
+    /// The poster beside a page whose address is known, where services that show links find it.
+    fn poster_path(&self) -> Option<PathBuf> {
+        self.address?;
+        Some(self.out.map_or_else(|| self.default_path(), Path::to_owned).with_extension("jpg"))
     }
 
     /// The model as stored, what is stated of it, and its settings.

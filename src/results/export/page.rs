@@ -4,12 +4,15 @@
 //! The viewer projects, shades and blends as the kernels do: a test view on the page equals the render of `eval` up to
 //! the rounding of the model to half floats.
 
+mod sharing;
+
 use glam::{DAffine3, DVec3};
 use half::f16;
-use nightsplat_core::camera::{Camera, CameraModel};
+use nightsplat_core::camera::{Camera, CameraModel, CameraPath};
 use nightsplat_photographs::image::Image;
 use serde_json::json;
 
+pub use self::sharing::Sharing;
 use super::{GENERATOR, Provenance, gzip};
 use crate::kernels::camera_pinhole::JACOBIAN_MARGIN;
 use crate::kernels::lamp::{LAMP_FARTHEST, LAMP_KNEE, LAMP_LEFT, LAMP_NEAREST};
@@ -21,12 +24,22 @@ use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::{Error, Result};
 
 /// The scripts of the page, in one scope.
-const VIEWER: [&str; 4] = [
+const VIEWER: [&str; 9] = [
     include_str!("viewer/draw.js"),
-    include_str!("viewer/live.js"),
-    include_str!("viewer/edit.js"),
+    include_str!("viewer/camera.js"),
+    include_str!("viewer/stage.js"),
     include_str!("viewer/fly.js"),
+    include_str!("viewer/compare.js"),
+    include_str!("viewer/edit.js"),
+    include_str!("viewer/frusta.js"),
+    include_str!("viewer/live.js"),
+    include_str!("viewer/page.js"),
 ];
+
+/// The most cameras that tell the page where photographs were taken; of more, evenly spread ones.
+const MOST_CAMERAS: usize = 96;
+/// The poses of the automatic flight.
+const FLIGHT: usize = 96;
 
 /// A bookmark: a camera and images of its view.
 #[derive(Clone, Debug)]
@@ -51,14 +64,18 @@ pub enum PageImage {
 /// The contents of a page.
 #[derive(Clone, Debug)]
 pub struct ModelPage<'a> {
-    /// The window's title.
-    pub title: String,
+    /// Its title, and how links show it.
+    pub sharing: Sharing,
     /// In the colours that viewers expect; `None`: fetched from the page's server, as often as they change.
     pub gaussians: Option<&'a Gaussians>,
     /// Provenance, shown on the page.
     pub provenance: Provenance,
     /// The page opens at the first.
     pub bookmarks: Vec<Bookmark>,
+    /// All cameras of the dataset, as those of the bookmarks: where the page's camera may go, and the automatic flight.
+    pub cameras: Vec<Camera>,
+    /// Whether the page shows cameras in space as it opens.
+    pub shows_cameras: bool,
     /// The world position that the coordinates of the Gaussians are relative to.
     pub origin: DVec3,
     /// The checksum of the model by which edit lists name it; `None`: the page edits nothing, or its server knows it.
@@ -74,37 +91,44 @@ pub struct ModelPage<'a> {
 impl ModelPage<'_> {
     /// The page as HTML.
     pub fn html(&self) -> Result<String> {
-        let Self { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up, lamp } =
-            self;
+        let Self { sharing, gaussians, provenance, bookmarks, cameras, up, .. } = self;
         let other = bookmarks.iter().find(|bookmark| bookmark.camera.model != CameraModel::Pinhole);
         if let Some(Bookmark { name, .. }) = other {
             return Err(Error::Usage(format!(
                 "view {name} is a fisheye, and the page renders pinhole cameras; load its dataset with --undistort"
             )));
         }
+        let seen = cameras.iter().step_by(cameras.len().div_ceil(MOST_CAMERAS).max(1));
         let scene = json!({
             "generator": GENERATOR,
             "provenance": provenance.lines(),
             "isLive": gaussians.is_none(),
-            "model": fingerprint,
-            "origin": origin.to_array(),
-            "near": near,
+            "showsCameras": self.shows_cameras,
+            "model": self.fingerprint,
+            "origin": self.origin.to_array(),
+            "near": self.near,
             "up": up.to_array(),
-            "lamp": lamp,
+            "lamp": self.lamp,
             "views": bookmarks.iter().map(view).collect::<Vec<_>>(),
+            "cameras": seen.map(lens_and_pose).collect::<Vec<_>>(),
+            "path": flight(cameras, *up)?,
         });
         let packed = |gaussians: &Gaussians| Ok::<_, Error>(base64(&gzip(&packed(gaussians))?));
         let model = gaussians.map(packed).transpose()?.unwrap_or_default();
         let ModelFacts { max_alpha: stated, antialiased, .. } = provenance.facts;
         let max_alpha = stated.unwrap_or_else(|| RenderSettings::default().max_alpha);
+        let (style, viewer) = (include_str!("viewer/style.css"), VIEWER.concat());
         let parts = [
-            ("@TITLE@", escape(title)),
-            ("@STYLE@", include_str!("viewer/style.css").to_owned()),
+            ("@HEAD@", sharing.head(&viewer, style, gaussians.is_none())),
+            ("@TITLE@", escape(&sharing.title)),
+            ("@TEXT@", sharing.paragraph()),
+            ("@POSTER@", sharing.embedded()),
+            ("@STYLE@", style.to_owned()),
             // No `<` in the data may end its script element.
             ("@SCENE@", scene.to_string().replace('<', "\\u003c")),
             ("@VERTEX@", shader(include_str!("viewer/splat.vert"), max_alpha, antialiased)),
             ("@FRAGMENT@", shader(include_str!("viewer/splat.frag"), max_alpha, antialiased)),
-            ("@VIEWER@", VIEWER.concat()),
+            ("@VIEWER@", viewer),
             ("@MODEL@", model),
         ];
         let mut html = String::new();
@@ -147,9 +171,34 @@ fn shader(text: &str, max_alpha: f32, antialiased: bool) -> String {
     text.replace("@CONSTANTS@", &constants.join("\n")).replace("@HARMONICS@", harmonics)
 }
 
+/// World to view along the automatic flight, which is closed; none through fewer than two cameras.
+fn flight(cameras: &[Camera], up: DVec3) -> Result<Vec<[f32; 12]>> {
+    if cameras.len() < 2 {
+        return Ok(vec![]);
+    }
+    let path = CameraPath::suited_about(cameras, up);
+    let pose = |camera: &Camera| camera.view_from_world.to_cols_array().map(|value| value as f32);
+    let mut poses: Vec<_> = path.cameras_about(cameras, up, FLIGHT)?.iter().map(pose).collect();
+    if path == CameraPath::Interpolate {
+        // From the last camera back again.
+        let back: Vec<_> = poses.iter().rev().copied().collect();
+        poses.extend(back);
+    }
+    Ok(poses)
+}
+
+fn lens_and_pose(camera: &Camera) -> serde_json::Value {
+    let Camera { width, height, focal, principal_point, view_from_world, .. } = camera;
+    json!({
+        "size": [width, height],
+        "focal": focal.to_array(),
+        "principalPoint": principal_point.to_array(),
+        "viewFromWorld": view_from_world.to_cols_array(),
+    })
+}
+
 fn view(bookmark: &Bookmark) -> serde_json::Value {
     let Bookmark { name, camera, pictures } = bookmark;
-    let Camera { width, height, focal, principal_point, view_from_world, .. } = camera;
     let pictures = pictures.iter().map(|(label, picture)| {
         let image = match picture {
             PageImage::Embedded(image) => jpeg(image),
@@ -157,14 +206,10 @@ fn view(bookmark: &Bookmark) -> serde_json::Value {
         };
         json!({ "label": label, "image": image })
     });
-    json!({
-        "name": name,
-        "size": [width, height],
-        "focal": focal.to_array(),
-        "principalPoint": principal_point.to_array(),
-        "viewFromWorld": view_from_world.to_cols_array(),
-        "pictures": pictures.collect::<Vec<_>>(),
-    })
+    let mut view = lens_and_pose(camera);
+    view["name"] = name.as_str().into();
+    view["pictures"] = pictures.collect();
+    view
 }
 
 /// The model as the viewer reads it: the number of Gaussians and the SH degree in 32 bits each, positions as floats,
@@ -210,10 +255,16 @@ mod tests {
         let picture = PageImage::Embedded(Image::from_fn(4, 3, |_, _| [0.5; 3]));
         let picture = (evil.to_owned(), picture);
         let page = ModelPage {
-            title: evil.to_owned(),
+            sharing: Sharing {
+                title: evil.to_owned(),
+                text: evil.to_owned(),
+                ..Sharing::default()
+            },
             gaussians: Some(&gaussians),
             provenance: Provenance { dataset: evil.to_owned(), ..Provenance::default() },
             bookmarks: vec![Bookmark { name: evil.to_owned(), camera, pictures: vec![picture] }],
+            cameras: vec![camera; 200],
+            shows_cameras: false,
             origin: DVec3::ZERO,
             fingerprint: None,
             near: 0.2,
@@ -237,6 +288,10 @@ mod tests {
         let lit = ModelPage { lamp: Some(Lamp::AT_CAMERA), ..page.clone() }.html().unwrap();
         assert!(lit.contains("\"reference_distance\":1.0") && html.contains("\"lamp\":null"));
         assert_eq!(html.matches("<script").count(), html.matches("</script>").count());
+        assert!(html.contains("<meta property=\"og:title\"") && !html.contains("og:image"));
+        assert!(html.contains("script-src 'sha256-") && !html.contains("-inline"));
+        let poses = html.matches("\"viewFromWorld\"").count();
+        assert_eq!(poses, 1 + 67, "of 200 cameras, every third");
         for outside in ["http://", "https://", "src=\"/", "@import"] {
             assert!(!html.contains(outside), "{outside}");
         }

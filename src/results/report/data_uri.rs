@@ -12,7 +12,12 @@ pub(super) fn png(image: &Image) -> String {
 /// The image as a JPEG of high quality; an empty URI for an image without pixels.
 pub(crate) fn jpeg(image: &Image) -> String {
     const QUALITY: u8 = 90;
-    uri("jpeg", image.to_jpeg(QUALITY))
+    jpeg_of_quality(image, QUALITY)
+}
+
+/// The image as a JPEG; an empty URI for an image without pixels.
+pub(crate) fn jpeg_of_quality(image: &Image, quality: u8) -> String {
+    uri("jpeg", image.to_jpeg(quality))
 }
 
 fn uri(kind: &str, file: Result<Vec<u8>>) -> String {

@@ -8,26 +8,28 @@ use nightsplat_photographs::tone::ToneCurve;
 use super::{ExportOptions, has_networks};
 use crate::Result;
 use crate::gpu::Gpu;
-use crate::results::edit::fingerprint;
 use crate::results::eval::ModelRenderer;
 use crate::results::export::Provenance;
-use crate::results::export::page::{Bookmark, ModelPage, PageImage, moved};
+use crate::results::export::page::{Bookmark, ModelPage, PageImage, Sharing, moved};
 use crate::results::finished_run::{FinishedRun, is_model};
+use crate::results::report::jpeg;
 use crate::results::run;
 use crate::splats::render::RenderSettings;
-use crate::splats::scene::Gaussians;
 use crate::targets::Targets;
 use crate::train::TrainConfig;
 
+/// The largest share of a page's bytes that photographs take where its size is limited.
+const PICTURES: f64 = 0.4;
+
 impl ExportOptions<'_> {
-    /// The page, with bookmarks of test views, or of all views if there are none. Its viewer has a pinhole camera:
-    /// photographs of a fisheye are undistorted and cropped to 60 degrees off the axis.
+    /// The page without its model, with bookmarks of test views, or of all views if there are none. Its viewer has a
+    /// pinhole camera: photographs of a fisheye are undistorted and cropped to 60 degrees off the axis.
     pub(super) fn page(
         &self,
         config: &TrainConfig,
-        gaussians: &Gaussians,
+        origin: DVec3,
         provenance: Provenance,
-    ) -> Result<String> {
+    ) -> Result<ModelPage<'static>> {
         let mut opened = None;
         let (dataset, mut renderer) = if has_networks(config) {
             let undistort = |config: &mut TrainConfig| config.undistort = true;
@@ -43,22 +45,47 @@ impl ExportOptions<'_> {
         };
         let device = || opened.map_or_else(|| self.opener.open(config), Ok);
         let targets = targets(config, &dataset, device)?;
-        let bookmarks = self.bookmarks(gaussians.origin, &dataset, targets, renderer.as_mut())?;
+        let mut bookmarks = self.bookmarks(origin, &dataset, targets, renderer.as_mut())?;
+        let sharing = self.sharing(&provenance.dataset, &bookmarks);
+        encode(&mut bookmarks, self.max_size.map(|most| (most as f64 * PICTURES) as usize));
         let is_model = is_model(self.source);
         let frame = if is_model { dataset.frame() } else { config.frame.unwrap_or_default() };
         let near = provenance.facts.near.or(config.facts(&frame).near);
-        let page = ModelPage {
-            title: format!("{} by nightsplat", provenance.dataset),
-            gaussians: Some(gaussians),
+        let camera = |view: &View| moved(&view.upright_camera(), origin);
+        Ok(ModelPage {
+            sharing,
+            gaussians: None,
             provenance,
             bookmarks,
-            origin: gaussians.origin,
-            fingerprint: Some(fingerprint(gaussians)),
+            cameras: dataset.views.iter().map(camera).collect(),
+            shows_cameras: false,
+            origin,
+            fingerprint: None,
             near: near.unwrap_or_else(|| RenderSettings::default().near).into(),
             up: self.up_of(config).unwrap_or_else(|| dataset.up()),
             lamp: if is_model { None } else { run::load_lamp(self.source)? },
-        };
-        page.html()
+        })
+    }
+
+    /// What the page says of itself. Its poster is the first view in normal light: as a reference image or a render, or
+    /// as the model was trained on it.
+    fn sharing(&self, dataset: &str, bookmarks: &[Bookmark]) -> Sharing {
+        let pictures = bookmarks.first().map(|first| first.pictures.as_slice()).unwrap_or_default();
+        let poster = pictures.last().and_then(|(_, picture)| match picture {
+            PageImage::Embedded(image) => Some(image.clone()),
+            PageImage::At(_) => None,
+        });
+        let file = self.poster_path().and_then(|path| Some(path.file_name()?.to_str()?.to_owned()));
+        let folder = self.address.map(|address| match address.rsplit_once('/') {
+            Some((folder, page)) if page.ends_with(".html") => folder,
+            _ => address.trim_end_matches('/'),
+        });
+        Sharing {
+            title: self.title.map_or_else(|| format!("{dataset} by nightsplat"), str::to_owned),
+            text: self.text.unwrap_or_default().to_owned(),
+            poster,
+            poster_address: folder.zip(file).map(|(folder, file)| format!("{folder}/{file}")),
+        }
     }
 
     /// Bookmarks of evenly spread views, with photographs, reference images or targets, and renders.
@@ -99,6 +126,28 @@ impl ExportOptions<'_> {
         };
         (0..count).map(bookmark).collect()
     }
+}
+
+/// Encodes the images once; as many bytes together as this at most, at smaller sizes.
+fn encode(bookmarks: &mut [Bookmark], most: Option<usize>) {
+    let encoded = |scale: f64, bookmarks: &[Bookmark]| -> Vec<String> {
+        let scaled = |side: u32| (f64::from(side) * scale).round() as u32;
+        let encoded = |(_, picture): &(String, PageImage)| match picture {
+            PageImage::Embedded(image) => {
+                jpeg(&image.resized(scaled(image.width), scaled(image.height)))
+            }
+            PageImage::At(address) => address.clone(),
+        };
+        bookmarks.iter().flat_map(|bookmark| &bookmark.pictures).map(encoded).collect()
+    };
+    let (mut scale, mut images) = (1.0, encoded(1.0, bookmarks));
+    let bytes = |images: &[String]| images.iter().map(String::len).sum::<usize>();
+    while scale > 0.05 && most.is_some_and(|most| bytes(&images) > most) {
+        scale *= 0.75;
+        images = encoded(scale, bookmarks);
+    }
+    let pictures = bookmarks.iter_mut().flat_map(|bookmark| &mut bookmark.pictures);
+    pictures.zip(images).for_each(|((_, picture), image)| *picture = PageImage::At(image));
 }
 
 /// What makes the targets of views that have a photograph and no reference image, where there are such views and a

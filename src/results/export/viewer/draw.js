@@ -3,7 +3,7 @@
 
 const element = (id) => document.getElementById(id);
 const scene = JSON.parse(element('scene').textContent);
-const canvas = element('canvas');
+const canvas = element('canvas'), root = document.documentElement;
 const say = (text) => { element('message').textContent = text; };
 
 // Half floats, decoded once.
@@ -26,11 +26,12 @@ async function unpack() {
 // Views of a packed model: positions, and all else as half floats.
 function opened(buffer) {
   const [count, degree] = new Uint32Array(buffer, 0, 2);
-  return { count, degree, means: new Float32Array(buffer, 8, 3 * count), rest: new Uint16Array(buffer, 8 + 12 * count) };
+  const means = new Float32Array(buffer, 8, 3 * count);
+  return { count, degree, means, rest: new Uint16Array(buffer, 8 + 12 * count) };
 }
 
-// Mean and opacity, then the covariance R S S^T R^T.
-function geometry({ count, means, rest }) {
+// Mean and opacity, then the covariance R S S^T R^T, then how well photographs show it.
+function geometry({ count, means, rest }, seen) {
   const data = new Float32Array(12 * count);
   const scales = count, quats = 4 * count;
   for (let i = 0; i < count; i++) {
@@ -45,6 +46,7 @@ function geometry({ count, means, rest }) {
     data.set(means.subarray(3 * i, 3 * i + 3), at);
     data[at + 3] = 1 / (1 + Math.exp(-halves[rest[i]]));
     data.set([entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)], at + 4);
+    data[at + 10] = seen ? seen[i] : 1;
   }
   return data;
 }
@@ -126,12 +128,18 @@ function program(gl, vertex, fragment) {
   return built;
 }
 
+function unfiltered(gl) {
+  for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+    gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+  }
+}
+
 // A texture at a unit, whose contents are replaced: full rows; what does not fit the device is refused.
 function texture(gl, unit, [internal, format, type]) {
   const own = gl.createTexture();
   gl.activeTexture(gl.TEXTURE0 + unit);
   gl.bindTexture(gl.TEXTURE_2D, own);
-  for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+  unfiltered(gl);
   return (data) => {
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE), width = Math.min(most, 4096);
     const height = Math.max(1, Math.ceil(data.length / 4 / width));
@@ -176,17 +184,16 @@ function renderer(gl, changed) {
 
   // Sums in half floats where the device blends them: eight bits would round at every splat.
   const fine = gl.getExtension('EXT_color_buffer_float') || gl.getExtension('EXT_color_buffer_half_float');
-  const sums = fine && gl.createFramebuffer(), image = fine && gl.createTexture();
-  const shown = fine && copier(gl);
+  const sums = gl.createFramebuffer(), image = gl.createTexture(), shown = copier(gl);
   let size = [0, 0];
   const resize = (width, height) => {
     if (size[0] === width && size[1] === height) return;
     size = [canvas.width, canvas.height] = [width, height];
-    if (!fine) return;
     gl.activeTexture(gl.TEXTURE2);
     gl.bindTexture(gl.TEXTURE_2D, image);
-    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.HALF_FLOAT, null);
+    unfiltered(gl);
+    const [internal, type] = fine ? [gl.RGBA16F, gl.HALF_FLOAT] : [gl.RGBA8, gl.UNSIGNED_BYTE];
+    gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, gl.RGBA, type, null);
     gl.bindFramebuffer(gl.FRAMEBUFFER, sums);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, image, 0);
   };
@@ -203,7 +210,8 @@ function renderer(gl, changed) {
   // Shows another model: in the old order, where it has as many Gaussians, until it is sorted.
   function load(buffer) {
     model = opened(buffer);
-    const data = geometry(model);
+    // What changes as it trains is not fogged: a model that comes every second must be shown soon.
+    const data = geometry(model, scene.isLive ? null : coverage(scene.cameras, model.means, model.count));
     geometryTexture(data);
     harmonicsTexture(harmonics(model));
     gl.useProgram(built);
@@ -232,8 +240,9 @@ function renderer(gl, changed) {
     gl.uniform2f(uniform('lampTones'), black, reach);
   }
 
-  // Draws at most a share of the Gaussians, the most important ones. Returns whether all that is asked for is drawn.
-  function draw(camera, width, height, { grey, layer, share, reach, lamp }) {
+  // Draws at most a share of the Gaussians, the most important ones. `fog` has how much of it there is and the depth at
+  // which it ends; `look` changes the colours. Returns whether all that is asked for is drawn.
+  function draw(camera, width, height, { grey, layer, share, reach, lamp, fog = [0, 0], look = PLAIN }) {
     resize(width, height);
     const m = camera.viewFromWorld, fit = placed(camera, width, height), limit = Math.ceil(share * count);
     const key = `${version} ${limit} ${m}`;
@@ -250,15 +259,16 @@ function renderer(gl, changed) {
     gl.uniform2fv(uniform('size'), camera.size.map((value) => value * fit.zoom));
     gl.uniform2f(uniform('offset'), fit.left, fit.top);
     gl.uniform2f(uniform('scale'), 2 / width, -2 / height);
+    gl.uniform2fv(uniform('fog'), fog);
     gl.uniform1i(uniform('layer'), fine ? layer : 0);
     gl.uniform1i(uniform('isLit'), lamp ? 1 : 0);
     if (lamp) light(lamp);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, fine ? sums : null);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, sums);
     gl.viewport(0, 0, width, height);
     if (layer && fine) gl.clearColor(0, 0, 0, 0); else gl.clearColor(grey, grey, grey, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, drawn.length);
-    if (fine) shown(layer, reach);
+    shown(fine ? layer : 0, reach, look);
     return drawn.key === key && limit === count;
   }
 
@@ -273,7 +283,10 @@ function renderer(gl, changed) {
   return { load, restrict, draw, sumsAt: fine && sumsAt, layers: fine ? LAYERS : LAYERS.slice(0, 1) };
 }
 
-// Shows the sums: colours as they are, quantities in colours from blue (0) to red (1).
+// Colours as they are: factors on the light of red, green and blue.
+const PLAIN = [1, 1, 1];
+
+// Shows the sums: colours with their look, quantities in colours from blue (0) to red (1).
 function copier(gl) {
   const built = program(gl,
     `#version 300 es
@@ -284,34 +297,37 @@ function copier(gl) {
      uniform sampler2D sums;
      uniform int layer;
      uniform float reach;
+     uniform vec3 look;
      out vec4 o;
      vec3 colored(float v) { return clamp(1.5 - abs(4.0 * v - vec3(3.0, 2.0, 1.0)), 0.0, 1.0); }
+     // More light bends towards white, which it reaches with the whitest, and clips nothing that was not clipped.
+     vec3 graded(vec3 color) {
+       vec3 light = pow(clamp(color, 0.0, 1.0), vec3(2.2));
+       vec3 bent = light * look / (1.0 + light * max(look - 1.0, 0.0));
+       return pow(bent, vec3(1.0 / 2.2));
+     }
      void main() {
        vec4 s = texelFetch(sums, ivec2(gl_FragCoord.xy), 0);
-       vec3 color = s.rgb;
+       vec3 color = look == vec3(1.0) ? s.rgb : graded(s.rgb);
        if (layer == 1) color = s.a < 0.05 ? vec3(0.0) : colored(reach / (reach + s.r / s.a));
        if (layer == 2) color = vec3(1.0 - s.a);
        if (layer == 3) color = s.r < 0.5 ? vec3(0.0) : colored(log2(s.r) / 10.0);
        o = vec4(color, 1);
      }`);
   const empty = gl.createVertexArray();
-  const [layerPlace, reachPlace] = ['layer', 'reach'].map((name) => gl.getUniformLocation(built, name));
-  return (layer, reach) => {
+  const [sums, layerPlace, reachPlace, lookPlace] =
+    ['sums', 'layer', 'reach', 'look'].map((name) => gl.getUniformLocation(built, name));
+  return (layer, reach, look) => {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.useProgram(built);
-    gl.uniform1i(gl.getUniformLocation(built, 'sums'), 2);
+    gl.uniform1i(sums, 2);
     gl.uniform1i(layerPlace, layer);
     gl.uniform1f(reachPlace, reach);
+    gl.uniform3fv(lookPlace, look);
     gl.disable(gl.BLEND);
     gl.bindVertexArray(empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);
     gl.enable(gl.BLEND);
   };
-}
-
-// Where a camera's image lies on the canvas: as large as fits, in the middle.
-function placed(camera, width, height) {
-  const zoom = Math.min(width / camera.size[0], height / camera.size[1]);
-  return { zoom, left: (width - zoom * camera.size[0]) / 2, top: (height - zoom * camera.size[1]) / 2 };
 }

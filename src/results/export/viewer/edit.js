@@ -18,8 +18,8 @@ function contains({ sphere, box }, point) {
   return point.every((value, k) => value >= box[0][k] && value <= box[1][k]);
 }
 
-// The list that `edit` reads. Those that count Gaussians come first, as they are numbered in the file, then those that are
-// placed in its world, then those that move the world.
+// The list that `edit` reads. Those that count Gaussians come first, as they are numbered in the file, then those that
+// are placed in its world, then those that move the world.
 function editList(edits, model) {
   const gone = new Set(edits.flatMap((edit) => edit.delete ?? []));
   const removal = gone.size ? [{ delete: spans([...gone].sort((a, b) => a - b)) }] : [];
@@ -27,16 +27,18 @@ function editList(edits, model) {
   return { nightsplat_edits: EDIT_VERSION, model, edits: [...removal, ...rest] };
 }
 
-function download(name, value) {
+const asJson = (value) => new Blob([JSON.stringify(value, null, 1) + '\n'], { type: 'application/json' });
+
+function download(name, blob) {
   const link = document.createElement('a');
-  link.href = URL.createObjectURL(new Blob([JSON.stringify(value, null, 1) + '\n'], { type: 'application/json' }));
+  link.href = URL.createObjectURL(blob);
   link.download = name;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
-// The tools. `world` has the camera's pose, a projection to the page, the target and the depth of a pixel; `restrict` draws
-// only some of the Gaussians.
+// The tools. `world` has the camera's pose, a projection to the page, the target and the depth of a pixel; `restrict`
+// draws only some of the Gaussians.
 function editor(world, restrict) {
   let model = null, edits = [], keyframes = [], clicks = [], stroke = null;
   const tool = () => element('tool').value;
@@ -58,12 +60,14 @@ function editor(world, restrict) {
     const keep = new Uint8Array(model.count).fill(1);
     for (const { delete: gone = [] } of [...edits, ...(stroke ? [stroke] : [])]) for (const i of gone) keep[i] = 0;
     if (crops.length) {
-      for (let i = 0; i < model.count; i++) if (keep[i] && !crops.every((crop) => contains(crop, position(i)))) keep[i] = 0;
+      const isKept = (i) => crops.every((crop) => contains(crop, position(i)));
+      for (let i = 0; i < model.count; i++) if (keep[i] && !isKept(i)) keep[i] = 0;
     }
     restrict(keep);
     const kept = keep.reduce((sum, value) => sum + value, 0);
     const names = edits.map((edit) => Object.keys(edit)[0]).join(', ') || 'none';
-    element('edits').textContent = `${kept} of ${model.count} Gaussians; edits: ${names}; ${keyframes.length} keyframes`;
+    element('edits').textContent =
+      `${kept} of ${model.count} Gaussians; edits: ${names}; ${keyframes.length} keyframes`;
   };
   const commit = (edit) => { edits.push(edit); clicks = []; preview(); };
 
@@ -90,11 +94,16 @@ function editor(world, restrict) {
   };
 
   const actions = {
-    apply: () => { if (['sphere', 'box'].includes(tool())) { const crop = region(); element('tool').value = ''; commit({ crop }); } },
+    apply: () => {
+      if (!['sphere', 'box'].includes(tool())) return;
+      const crop = region();
+      element('tool').value = '';
+      commit({ crop });
+    },
     undo: () => { edits.pop(); preview(); },
     keyframe: () => { keyframes.push(world.keyframe()); preview(); },
-    saveEdits: () => download('edits.json', list()),
-    savePath: () => download('path.json', path()),
+    saveEdits: () => download('edits.json', asJson(list())),
+    savePath: () => download('path.json', asJson(path())),
   };
   for (const [id, act] of Object.entries(actions)) element(id).addEventListener('click', act);
   for (const id of ['tool', 'sizeX', 'sizeY', 'sizeZ']) element(id).addEventListener('input', () => {
@@ -105,9 +114,10 @@ function editor(world, restrict) {
     preview();
   });
   const list = () => editList(edits, scene.model);
-  const path = () => ({ nightsplat_path: 1, fps: 30, easing: 'smooth', keyframes: keyframes.map((own, k) => ({ time: 2 * k, ...own })) });
+  const timed = () => keyframes.map((own, k) => ({ time: 2 * k, ...own }));
+  const path = () => ({ nightsplat_path: 1, fps: 30, easing: 'smooth', keyframes: timed() });
   // For scripts and tests.
-  window.nightsplat = { edits: list, path };
+  window.nightsplat = { edits: list, path, camera: world.keyframe };
 
   return {
     load: (buffer) => { model = opened(buffer); if (edits.length) preview(); },

@@ -1,6 +1,8 @@
 // Follows a training: asks the page's server for progress, and for the model when it has changed.
 
 const ASK_EVERY = 1000;  // milliseconds
+// The most views whose photographs an exported page has.
+const MOST_SHARED = 8;
 
 async function asked(path) {
   const response = await fetch(path, { cache: 'no-store' });
@@ -43,37 +45,69 @@ function plot(heldOut) {
   element('line').setAttribute('points', x.map((value, k) => `${value},${23 - y[k]}`).join(' '));
 }
 
+// Bytes as a data URI.
+const asUri = (blob) => new Promise((done, failed) => {
+  const reader = new FileReader();
+  [reader.onload, reader.onerror] = [() => done(reader.result), failed];
+  reader.readAsDataURL(blob);
+});
+
+// A page for sharing, of the model that is shown: this page with its model and photographs of some views within.
+async function sharedPage(source, buffer) {
+  const every = Math.max(1, Math.ceil(scene.views.length / MOST_SHARED));
+  const views = scene.views.filter((_, k) => k % every === 0), pictures = views.map(async (view) => {
+    // Of a server that has ended, the page has none.
+    const fetched = async (image) => asUri(await (await asked(image)).blob());
+    const images = view.pictures.map(async ({ label, image }) => ({ label, image: await fetched(image) }));
+    return (await Promise.allSettled(images)).flatMap(({ value }) => value ?? []);
+  });
+  const own = { ...scene, isLive: false, showsCameras: false, views: [] };
+  for (const [k, view] of views.entries()) own.views.push({ ...view, pictures: await pictures[k] });
+  const packed = await new Response(new Blob([buffer]).stream().pipeThrough(new CompressionStream('gzip'))).blob();
+  const model = (await asUri(packed)).replace(/^.*,/, '');
+  const within = (page, id, text) =>
+    page.replace(new RegExp(`([<]script id="${id}"[^>]*>)[^<]*`), (_, begin) => begin + text);
+  return within(within(source, 'scene', JSON.stringify(own).replaceAll('<', '\\u003c')), 'model', model);
+}
+
 // Shows every model that comes; returns once the first is shown.
 async function follow(show) {
-  element('live').hidden = false;
-  let version = 0, isPaused = false;
+  element('live').hidden = scene.showsCameras;
+  let version = 0, isPaused = false, hasEnded = false, buffer = null;
+  const source = await (await asked('')).text();
   const order = async (what) => { await fetch(`do/${what}`, { method: 'POST' }); await look(); };
   element('pause').addEventListener('click', () => order(isPaused ? 'resume' : 'pause'));
   for (const what of ['save', 'stop']) element(what).addEventListener('click', () => order(what));
+  element('exportPage').addEventListener('click', async () => {
+    download('model.html', new Blob([await sharedPage(source, buffer)], { type: 'text/html' }));
+  });
 
   async function look() {
     const state = await (await asked('state')).json();
     isPaused = state.phase === 'paused';
-    element('progress').textContent = summary(state);
+    hasEnded = Boolean(state.endedBy);
+    element('progress').textContent = state.endedBy ?? summary(state);
     element('controls').hidden = !state.canControl;
     element('pause').textContent = isPaused ? 'Continue' : 'Pause';
     plot(state.heldOut ?? []);
     scene.model = state.fingerprint;
     element('editor').hidden = !scene.model;
     if (state.model !== version) {
-      show(await (await asked('model')).arrayBuffer());
+      buffer = await (await asked('model')).arrayBuffer();
+      show(buffer);
       version = state.model;
-      document.documentElement.dataset.version = String(version);
+      root.dataset.version = String(version);
     }
   }
   async function again() {
     try {
       if (!document.hidden) await look();
     } catch (error) {
-      element('progress').textContent = 'the program that serves this page has ended or cannot be reached; the last model is shown';
+      element('progress').textContent =
+        'the program that serves this page has ended or cannot be reached; the last model is shown';
       element('controls').hidden = true;
     }
-    setTimeout(again, ASK_EVERY);
+    if (!hasEnded) setTimeout(again, ASK_EVERY);
   }
   await look();
   if (!version) say('Waiting for the first model …');
@@ -81,5 +115,6 @@ async function follow(show) {
     await new Promise((done) => setTimeout(done, ASK_EVERY));
     await look();
   }
+  element('exports').hidden = false;
   setTimeout(again, ASK_EVERY);
 }

@@ -1,16 +1,18 @@
 #version 300 es
-// One corner of a splat: the projection of the kernels (EWA), with their constants and harmonics, on textures of three and of (degree + 1)^2 texels a Gaussian.
+// One corner of a splat: the projection of the kernels (EWA), with their constants and harmonics, on textures of three
+// and of (degree + 1)^2 texels a Gaussian.
 precision highp float;
 precision highp int;
 precision highp sampler2D;
 
-uniform sampler2D geometry;  // mean and opacity; covariance xx xy xz yy; yz zz
+uniform sampler2D geometry;  // mean and opacity; covariance xx xy xz yy; yz zz, coverage
 uniform sampler2D harmonics; // coefficients, RGB
 uniform mat4 viewFromWorld;
 uniform vec3 eye;
 uniform vec2 focal, principalPoint, size;  // pixels of the view
 uniform vec2 offset, scale;                // pixels of the view to clip space
 uniform float near;
+uniform vec2 fog;  // how much hides what no photograph shows, and what is nearer than a depth
 uniform uint degree;  // of the harmonics
 uniform bool isLit;   // by a lamp at the camera
 uniform vec3 lampPosition, lampAxis;  // in the view
@@ -84,12 +86,12 @@ void main() {
     float xx = dot(u, covariance * u) + DILATION, xy = dot(u, covariance * v), yy = dot(v, covariance * v) + DILATION;
     float determinant = xx * yy - xy * xy;
     if (!(determinant > 0.0)) return;
-    float opacity = a.w;
+    float opacity = a.w * mix(1.0, c.z * smoothstep(near, near + max(fog.y, 1e-4), mean.z), fog.x);
     if (ANTIALIASED) {
         float undilated = determinant - DILATION * (xx + yy) + DILATION * DILATION;
         opacity *= sqrt(max(undilated, 0.0) / determinant);
-        if (!(opacity > ALPHA_MIN)) return;
     }
+    if (!(opacity > ALPHA_MIN)) return;
     conic = vec3(yy, -xy, xx) / determinant;
 
     vec2 reach = sqrt(2.0 * log(opacity / ALPHA_MIN) * vec2(xx, yy)) + 0.5;
