@@ -82,7 +82,7 @@ DEFECTS = [
     ("SSIM's windows are incomplete at the ends of a run", "shaders-glsl/loss/ssim.comp",
      "(2 * RADIUS + ALIGNMENT - 1)", "(RADIUS + ALIGNMENT - 1)", "--test loss"),
     ("Gaussians of a later batch take the numbers of the first", "shaders-glsl/splats/render/project.comp",
-     "ids[i] = first_gaussian + i;", "ids[i] = i;", "--test splats batches::"),
+     "ids[slot] = first + slot;", "ids[slot] = slot;", "--test splats batches::"),
     ("a batch decides for the Gaussians of others", "shaders-glsl/splats/densify/densify_decide.comp",
      "if (i - first_gaussian >= batch_count) return;", "", "--test splats batches::"),
     ("the children of a batch keep its offset", "shaders-glsl/splats/densify/densify_scatter.comp",

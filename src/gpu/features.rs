@@ -10,7 +10,7 @@ use super::functions::CoreVersion;
 use crate::{Error, Result};
 
 /// A feature, and where its bit is.
-struct Feature {
+struct NeededFeature {
     name: &'static str,
     /// In the struct of its Vulkan version.
     in_version: Bit,
@@ -33,7 +33,7 @@ macro_rules! bit {
 }
 macro_rules! feature {
     ($name:expr, $feature:ident, $version:ident, $extension:ident, $storage:ident) => {
-        Feature {
+        NeededFeature {
             name: $name,
             in_version: bit!($version, $feature),
             in_extension: bit!($extension, $feature),
@@ -42,7 +42,7 @@ macro_rules! feature {
     };
 }
 
-const FEATURES: [Feature; 5] = [
+const FEATURES: [NeededFeature; 5] = [
     feature!(
         "timelineSemaphore",
         timeline_semaphore,
@@ -122,8 +122,8 @@ impl FeatureStructs {
 /// Enables the features that the library needs, in the chain with which a host creates the device that it lends to
 /// [`Gpu::from_host`](super::Gpu::from_host). `chain` is the host's `VkDeviceCreateInfo` or
 /// `VkPhysicalDeviceFeatures2`. Each feature is enabled in the struct that has it, of a Vulkan version or of an
-/// extension; for the others, `structs` are appended. `chained_later` are the `VkStructureType`s of feature structs that
-/// the host adds itself afterwards, and with which it enables the features.
+/// extension; for the others, `structs` are appended. `chained_later` are the `VkStructureType`s of feature structs
+/// that the host adds itself afterwards, and with which it enables the features.
 ///
 /// Without Vulkan 1.3, the host enables the extensions `VK_KHR_synchronization2` and `VK_EXT_subgroup_size_control` as
 /// well. With `VK_KHR_push_descriptor`, where it is supported, recording is faster.
@@ -162,7 +162,7 @@ pub unsafe fn require_features(
     }
 }
 
-impl Feature {
+impl NeededFeature {
     /// The bit in a struct of a chain, if it has it.
     ///
     /// # Safety
@@ -177,7 +177,7 @@ impl Feature {
     }
 
     /// # Safety
-    /// As [`Feature::find`], and the struct may be written.
+    /// As [`NeededFeature::find`], and the struct may be written.
     unsafe fn enable(&self, at: *mut vk::BaseOutStructure<'_>) {
         // SAFETY: as the caller promises.
         unsafe {
@@ -224,7 +224,7 @@ pub(super) unsafe fn check_enabled(
     let has_flag = !missing.iter().any(|feature| feature.name == FULL_SUBGROUPS);
     missing.retain(|feature| feature.name != FULL_SUBGROUPS || version < CoreVersion::V1_3);
     match missing.first() {
-        Some(Feature { name, .. }) => Err(Error::NoDevice(format!(
+        Some(NeededFeature { name, .. }) => Err(Error::NoDevice(format!(
             "the enabled features lack {name}; create the device with require_features (nsp_require_features)"
         ))),
         None if has_flag => Ok(FullSubgroups::ByFlag),
@@ -271,8 +271,8 @@ mod tests {
 
     #[test]
     fn what_is_missing_is_added_once_and_what_comes_later_is_not() {
-        let mut own = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
-        let mut info = vk::DeviceCreateInfo::default().push_next(&mut own);
+        let mut subgroups = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
+        let mut info = vk::DeviceCreateInfo::default().push_next(&mut subgroups);
         let timeline = vk::PhysicalDeviceTimelineSemaphoreFeatures::STRUCTURE_TYPE;
         let mut structs = FeatureStructs::default();
         // SAFETY: a valid chain.
@@ -288,7 +288,7 @@ mod tests {
         // SAFETY: a valid chain.
         let missing = unsafe { check_enabled(info.p_next, CoreVersion::V1_3) }.unwrap_err();
         assert!(missing.to_string().contains("timelineSemaphore"), "{missing}");
-        assert_eq!((own.subgroup_size_control, own.compute_full_subgroups), (1, 1));
+        assert_eq!((subgroups.subgroup_size_control, subgroups.compute_full_subgroups), (1, 1));
         assert_eq!(structs.synchronization2.synchronization2, 1);
     }
 

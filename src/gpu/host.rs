@@ -208,9 +208,8 @@ impl GpuShared {
 
 impl Gpu {
     /// Records into a command buffer of the host application, which submits it once, in the order of recording. What
-    /// the recording uses is kept until the frame is done. It begins with the uploads that wait, and a recording of
-    /// nothing else is one of uploads alone. Where a host drops a recording and reports its frame as done, its uploads
-    /// are part of the next.
+    /// the recording uses is kept until the frame is done. It begins with the uploads that wait. Where a host drops a
+    /// recording and reports its frame as done, its uploads are part of the next.
     ///
     /// # Errors
     /// What `record` returns; [`Error::Usage`] where the frame's number falls, the device is not lent, or this thread

@@ -4,11 +4,11 @@ use std::ffi::{CStr, c_char, c_void};
 
 /// A device that a host application lends, as raw handles, so that C++ hosts and other Vulkan bindings work.
 ///
-/// The host must have enabled what [`super::require_features`] enables. The instance is of Vulkan 1.1 or later. Where it
-/// is not of Vulkan 1.3, the device has the extensions `VK_KHR_synchronization2` and `VK_EXT_subgroup_size_control`;
-/// where it is of Vulkan 1.1, also `VK_KHR_timeline_semaphore`, `VK_EXT_scalar_block_layout` and `VK_KHR_spirv_1_4`. The
-/// host keeps device, instance and queue alive for as long as the [`Gpu`](super::Gpu) and everything made with it. What
-/// is left at its default is not used:
+/// The host must have enabled what [`super::require_features`] enables. The instance is of Vulkan 1.1 or later. Where
+/// it is not of Vulkan 1.3, the device has the extensions `VK_KHR_synchronization2` and `VK_EXT_subgroup_size_control`;
+/// where it is of Vulkan 1.1, also `VK_KHR_timeline_semaphore`, `VK_EXT_scalar_block_layout` and `VK_KHR_spirv_1_4`.
+/// The host keeps device, instance and queue alive for as long as the [`Gpu`](super::Gpu) and everything made with it.
+/// What is left at its default is not used:
 ///
 /// ```
 /// use nightsplat::HostDevice;

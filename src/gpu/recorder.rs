@@ -243,8 +243,8 @@ impl<'g> Recorder<'g> {
         Ok(())
     }
 
-    /// Records passes that write different parts of the same buffers, with no barrier between them. A check, which copies
-    /// between passes, has its barriers.
+    /// Records passes that write different parts of the same buffers, with no barrier between them. A check, which
+    /// copies between passes, has its barriers.
     pub(crate) fn concurrently<R>(
         &mut self,
         record: impl FnOnce(&mut Self) -> Result<R>,
@@ -270,8 +270,8 @@ impl<'g> Recorder<'g> {
         }
     }
 
-    /// Overwrites the first elements of `buffer` with `data`, which is stored in the command buffer: for numbers that the
-    /// host knows when it records.
+    /// Overwrites the first elements of `buffer` with `data`, which is stored in the command buffer: for numbers that
+    /// the host knows when it records.
     pub(crate) fn update<T: bytemuck::Pod>(
         &mut self,
         buffer: &mut Buffer<T>,

@@ -25,6 +25,7 @@ mod instances;
 mod lamp;
 mod limits;
 mod pipelines;
+mod projection;
 mod settings;
 mod target;
 
@@ -35,9 +36,7 @@ use glam::{UVec2, Vec2};
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads, Tile};
 use crate::kernels::splat::MAX_CHANNELS;
-use crate::kernels::{
-    self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
-};
+use crate::kernels::{self, blend_backward, blend_forward, emit, order_counts, project_backward};
 use crate::splats::batches::GradientKind;
 use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
 use crate::{Error, Result};
@@ -361,53 +360,6 @@ impl Renderer {
             )?;
         }
         self.record_lamp_backward(pass, gaussians, &view, gradients.parameters)
-    }
-
-    /// Records the projection of the context, and of the Gaussians of a view, which come after it.
-    fn record_project(
-        &mut self,
-        pass: &mut Recorder<'_>,
-        gaussians: GaussianSlice<'_>,
-        view: &KernelView<'_>,
-        sh_degree: u32,
-    ) -> Result<()> {
-        let Self { gpu, settings, projections, frame, context, lamp, .. } = self;
-        let color_floats = color_floats(view.channels);
-        let project = &projections[&view.kind].forward;
-        let context = context.as_ref().map(DeviceGaussians::slice);
-        let of_view = (gaussians, context.map_or(0, |context| context.layout.count));
-        let all = context.into_iter().map(|context| (context, 0)).chain([of_view]);
-        for (GaussianSlice { layout, parameters }, first) in all {
-            for batch in layout.batches(gpu).iter() {
-                let rendered = batch.after(first);
-                pass.dispatch(
-                    project,
-                    &project::Params {
-                        camera_index: view.camera_index,
-                        near: settings.near,
-                        gaussian_count: batch.gaussian_count(),
-                        sh_degree,
-                        first_gaussian: rendered.first_gaussian(),
-                        first_instance: 0,
-                        instance_count: 0,
-                        first_splat: 0,
-                    },
-                    project::Buffers {
-                        parameters: batch.rows(parameters, layout.words())?,
-                        splats: rendered.rows_mut(&mut frame.splats, 1)?,
-                        colors: rendered.rows_mut(&mut frame.colors, color_floats)?,
-                        depth_keys: rendered.rows_mut(&mut frame.depth_keys, 1)?,
-                        ids: rendered.rows_mut(&mut frame.ids, 1)?,
-                        tile_counts: rendered.rows_mut(&mut frame.tile_counts, 1)?,
-                        cameras: view.cameras.unwrap_or(&frame.camera).slice(),
-                        lamp: lamp::bound(lamp.as_ref(), parameters)?,
-                        instances: frame.instances.slice(),
-                    },
-                    Threads::Exactly([batch.gaussian_count(), 1, 1]),
-                )?;
-            }
-        }
-        Ok(())
     }
 
     /// Refuses Gaussians in another layout than the kernels read, or more than there is memory for.

@@ -23,7 +23,7 @@ use crate::splats::harmonics::HarmonicRotation;
 #[cfg(feature = "train")]
 pub(crate) use change::{Lengths, is_far};
 #[doc(hidden)]
-pub use device::Bounds;
+pub use device::GaussianBounds;
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
 pub use facts::ModelFacts;
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};

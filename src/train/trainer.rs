@@ -242,8 +242,8 @@ impl Trainer {
         }
     }
 
-    /// [`Trainer::advance`] for about `budget` instead of half a second. A call takes a step at the least; density control
-    /// and the scores of held-out views, where they are due, come on top.
+    /// [`Trainer::advance`] for about `budget` instead of half a second. A call takes a step at the least; density
+    /// control and the scores of held-out views, where they are due, come on top.
     ///
     /// # Errors
     /// Those of [`Trainer::advance`].

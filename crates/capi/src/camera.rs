@@ -65,7 +65,8 @@ pub(super) fn affine(m: &[f64; 12]) -> DAffine3 {
 /// depth 0 to 1, or reversed). The camera may look along z or -z, with y up or down. `width` and `height` are those of
 /// the viewport in pixels.
 ///
-/// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared, or if the matrices scale or mirror the world.
+/// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared, or if the matrices scale or mirror the
+/// world.
 ///
 /// # Safety
 /// `view` and `projection` are NULL or hold 16 floats; `camera` is NULL or valid, with its `struct_size`.

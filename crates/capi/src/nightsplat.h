@@ -241,14 +241,15 @@ typedef struct NspInstance {
     size_t struct_size;
     // The model; NULL with a trainer.
     const struct NspModel *model;
-    // A trainer whose Gaussians are drawn as they are, without a copy: the recording is submitted before the next call of
-    // `nsp_trainer_advance`, to the same queue. NULL: a model.
+    // A trainer whose Gaussians are drawn as they are, without a copy: the recording is submitted before the next call
+    // of `nsp_trainer_advance`, to the same queue. NULL: a model.
     const struct NspTrainer *trainer;
     // The rigid transform from the model's world to that of the cameras, three rows of four; all zeros: none.
     double pose[12];
     // The factor on lengths of the model, before the pose; 0 stands for 1.
     double scale;
-    // Factors of display-referred red, green and blue, 0 or more, and of the opacity, 0 to 1; all zeros stand for ones.
+    // Factors of display-referred red, green and blue, 0 or more, and of the opacity, 0 to 1; all zeros stand for
+    // ones.
     float tint[4];
     // The least corner of the clip box, in the model's world.
     double clip_min[3];
@@ -416,7 +417,8 @@ void nsp_device_destroy(struct NspDevice *device);
 // depth 0 to 1, or reversed). The camera may look along z or -z, with y up or down. `width` and `height` are those of
 // the viewport in pixels.
 //
-// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared, or if the matrices scale or mirror the world.
+// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared, or if the matrices scale or mirror the
+// world.
 NspResult nsp_camera_from_matrices(const float *view,
                                    const float *projection,
                                    uint32_t width,
@@ -458,13 +460,12 @@ NspResult nsp_renderer_create(struct NspDevice *device, const struct NspModel *m
 // Allocates memory for views of this size and for this many intersections, ahead of the first recording.
 NspResult nsp_renderer_reserve(struct NspRenderer *renderer, uint32_t width, uint32_t height, uint32_t intersections);
 
-// Records the render of a model, or of `NspRender::instances` if `model` is NULL. Nothing is submitted, and nothing is waited for. If the view needs more memory than
-// there is, the nearest splats are drawn, and a later call allocates more.
+// Records the render of a model, or of `NspRender::instances` if `model` is NULL. Nothing is submitted, and nothing is
+// waited for. If the view needs more memory than there is, the nearest splats are drawn, and a later call allocates
+// more.
 //
 // It binds compute pipelines, descriptor set 0 and push constants, and restores none of them.
-NspResult nsp_record_render(struct NspRenderer *renderer,
-                            const struct NspModel *model,
-                            const struct NspRender *render);
+NspResult nsp_record_render(struct NspRenderer *renderer, const struct NspModel *model, const struct NspRender *render);
 
 // Writes the outcome of the newest frame that is done to `status`. It never waits.
 NspResult nsp_renderer_status(const struct NspRenderer *renderer, struct NspStatus *status);

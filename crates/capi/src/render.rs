@@ -121,14 +121,15 @@ pub struct NspInstance {
     pub struct_size: usize,
     /// The model; NULL with a trainer.
     pub model: *const NspModel,
-    /// A trainer whose Gaussians are drawn as they are, without a copy: the recording is submitted before the next call of
-    /// `nsp_trainer_advance`, to the same queue. NULL: a model.
+    /// A trainer whose Gaussians are drawn as they are, without a copy: the recording is submitted before the next call
+    /// of `nsp_trainer_advance`, to the same queue. NULL: a model.
     pub trainer: *const NspTrainer,
     /// The rigid transform from the model's world to that of the cameras, three rows of four; all zeros: none.
     pub pose: [f64; 12],
     /// The factor on lengths of the model, before the pose; 0 stands for 1.
     pub scale: f64,
-    /// Factors of display-referred red, green and blue, 0 or more, and of the opacity, 0 to 1; all zeros stand for ones.
+    /// Factors of display-referred red, green and blue, 0 or more, and of the opacity, 0 to 1; all zeros stand for
+    /// ones.
     pub tint: [f32; 4],
     /// The least corner of the clip box, in the model's world.
     pub clip_min: [f64; 3],
@@ -286,8 +287,9 @@ pub unsafe extern "C" fn nsp_renderer_reserve(
     })
 }
 
-/// Records the render of a model, or of `NspRender::instances` if `model` is NULL. Nothing is submitted, and nothing is waited for. If the view needs more memory than
-/// there is, the nearest splats are drawn, and a later call allocates more.
+/// Records the render of a model, or of `NspRender::instances` if `model` is NULL. Nothing is submitted, and nothing is
+/// waited for. If the view needs more memory than there is, the nearest splats are drawn, and a later call allocates
+/// more.
 ///
 /// It binds compute pipelines, descriptor set 0 and push constants, and restores none of them.
 ///
@@ -443,7 +445,7 @@ unsafe fn lent_instance<'a>(
             let LoadedModel { model, on_device } = model.0.get("a model")?;
             if appearance(model) != shown.appearance {
                 return Err(Failure::usage(format!(
-                    "the model of instance {at} has other colours, alpha limit or antialiasing than that of the renderer"
+                    "the model of instance {at} has other colours, alpha limit or antialiasing than the renderer's"
                 )));
             }
             Instance::new(on_device)

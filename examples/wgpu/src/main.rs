@@ -74,11 +74,11 @@ fn draw(host: &Host, model: &Model, wall: Option<f32>) -> Result<Vec<u8>, Box<dy
 
 /// Of the bytes from those of the same camera on a device of the library's own; where there is a wall, in the right half.
 fn largest_difference(model: &Model, pixels: &[u8], has_wall: bool) -> nightsplat::Result<u8> {
-    let own = Gpu::new(&DeviceChoice::Best)?;
+    let gpu = Gpu::new(&DeviceChoice::Best)?;
     let camera = camera(model);
-    let mut renderer = Renderer::new(&own, model.render_settings())?;
+    let mut renderer = Renderer::new(&gpu, model.render_settings())?;
     renderer.reserve(model.gaussians.count, [&camera])?;
-    let uploaded = model.gaussians.upload(&own)?;
+    let uploaded = model.gaussians.upload(&gpu)?;
     let image = renderer.render_image(&uploaded, &camera, &options(model))?;
     let columns = if has_wall { SIZE[0] / 2 } else { 0 }..SIZE[0];
     let mut largest = 0;

@@ -6,11 +6,12 @@ use glam::{DAffine3, DMat3, DVec3, Vec3};
 use nightsplat_core::camera::{Camera, CameraModel, deviation_from_rigid};
 
 use super::pipelines::ProjectionKind;
-use super::{KernelView, RenderSettings, Renderer, color_floats};
-use crate::gpu::{Kernel as _, Recorder, Threads};
-use crate::kernels::{self, InstanceView, project};
+use super::projection::{GROUP, Projected};
+use super::{KernelView, RenderSettings, Renderer};
+use crate::gpu::Recorder;
+use crate::kernels::{self, InstanceView};
 use crate::splats::packed_sh::StorageFormat;
-use crate::splats::scene::{Bounds, DeviceGaussians, GaussianSlice, Layout};
+use crate::splats::scene::{DeviceGaussians, GaussianBounds, GaussianSlice, Layout};
 use crate::{Error, Result};
 
 /// A model in a draw, which may have others, and itself again elsewhere. The Gaussians are shared: nothing is copied.
@@ -106,7 +107,7 @@ impl<'a> Instance<'a> {
 /// A splat ends where its alpha is 1 / 255, at most this number of standard deviations from its centre.
 const DEVIATIONS: f64 = 3.34;
 
-impl Bounds {
+impl GaussianBounds {
     /// What `project` computes, bounded: a splat is within `DEVIATIONS` of its standard deviation on the image, which
     /// is no more than focal / depth sqrt(1 + slope^2) of that in the world, and the dilation.
     fn may_be_seen(
@@ -155,14 +156,13 @@ pub(super) fn stored(layout: &Layout) -> (u32, StorageFormat) {
 
 /// The splats of an instance: those of its Gaussians, and of whole workgroups, so that each model's can be bound.
 fn splats_of(layout: &Layout) -> usize {
-    layout.count.next_multiple_of(project::Kernel::INTERFACE.workgroup_size[0] as usize)
+    layout.count.next_multiple_of(GROUP as usize)
 }
 
 /// The Gaussians of one model, and its instances in the table.
 struct InstancedModel<'a> {
     gaussians: GaussianSlice<'a>,
-    first_instance: u32,
-    instance_count: u32,
+    instances: Range<u32>,
     /// Of all its instances.
     splats: Range<usize>,
 }
@@ -193,14 +193,14 @@ impl<'a> VisibleInstances<'a> {
         }
         let (mut models, mut table, mut count) = (vec![], vec![], 0);
         for (gaussians, instances) in by_model {
-            let first_instance = table.len() as u32;
-            let instance_count = instances.len() as u32;
+            let first = table.len() as u32;
             let each = splats_of(&gaussians.layout);
             let views = instances.iter().zip((0..).step_by(each.max(1)));
             table.extend(views.map(|(instance, first)| instance.view(camera, first)));
             let splats = count..count + each * instances.len();
             count = splats.end;
-            models.push(InstancedModel { gaussians, first_instance, instance_count, splats });
+            let instances = first..table.len() as u32;
+            models.push(InstancedModel { gaussians, instances, splats });
         }
         Self { models, table, count }
     }
@@ -229,63 +229,26 @@ impl Renderer {
         sh_degree: u32,
     ) -> Result<()> {
         pass.update(&mut self.frame.instances, &visible.table)?;
-        let batches = |model: &InstancedModel<'_>| model.gaussians.layout.batches(&self.gpu);
+        let (mut projecting, _) = self.projecting();
+        let gpu = projecting.gpu;
         // Each model writes splats of its own, unless it takes several passes.
-        let are_disjoint = visible.models.iter().all(|model| batches(model).iter().count() == 1);
+        let passes =
+            |model: &InstancedModel<'_>| model.gaussians.layout.batches(gpu).iter().count();
+        let are_disjoint = visible.models.iter().all(|model| passes(model) == 1);
         let mut record = |pass: &mut Recorder<'_>| {
-            visible
-                .models
-                .iter()
-                .try_for_each(|model| self.record_model(pass, model, view, sh_degree))
+            visible.models.iter().try_for_each(|model| {
+                let InstancedModel { gaussians, ref instances, ref splats } = *model;
+                let kind =
+                    ProjectionKind { instances: Some(stored(&gaussians.layout)), ..view.kind };
+                let sh_degree = sh_degree.min(gaussians.layout.shape.sh_degree);
+                let (splats, instances) = (splats.clone(), instances.clone());
+                projecting.record(
+                    pass,
+                    view,
+                    &Projected { gaussians, kind, sh_degree, splats, instances },
+                )
+            })
         };
         if are_disjoint { pass.concurrently(record) } else { record(pass) }
-    }
-
-    /// Records the projection of the instances of a model.
-    fn record_model(
-        &mut self,
-        pass: &mut Recorder<'_>,
-        model: &InstancedModel<'_>,
-        view: &KernelView<'_>,
-        sh_degree: u32,
-    ) -> Result<()> {
-        let Self { gpu, settings, projections, frame, lamp, .. } = self;
-        let InstancedModel { first_instance, instance_count, ref splats, .. } = *model;
-        let GaussianSlice { layout, parameters } = model.gaussians;
-        let kind = ProjectionKind { instances: Some(stored(&layout)), ..view.kind };
-        let floats = color_floats(view.channels);
-        for batch in layout.batches(gpu).iter() {
-            let gaussian_count = batch.gaussian_count();
-            let groups = gaussian_count.div_ceil(project::Kernel::INTERFACE.workgroup_size[0]);
-            pass.dispatch(
-                &projections[&kind].forward,
-                &project::Params {
-                    camera_index: view.camera_index,
-                    near: settings.near,
-                    gaussian_count,
-                    sh_degree: sh_degree.min(layout.shape.sh_degree),
-                    first_gaussian: batch.first_gaussian(),
-                    first_instance,
-                    instance_count,
-                    first_splat: splats.start as u32,
-                },
-                project::Buffers {
-                    parameters: batch.rows(parameters, layout.words())?,
-                    splats: frame.splats.slice_mut().range(splats.clone())?,
-                    colors: frame
-                        .colors
-                        .slice_mut()
-                        .range(floats * splats.start..floats * splats.end)?,
-                    depth_keys: frame.depth_keys.slice_mut().range(splats.clone())?,
-                    ids: frame.ids.slice_mut().range(splats.clone())?,
-                    tile_counts: frame.tile_counts.slice_mut().range(splats.clone())?,
-                    cameras: view.cameras.unwrap_or(&frame.camera).slice(),
-                    lamp: super::lamp::bound(lamp.as_ref(), parameters)?,
-                    instances: frame.instances.slice(),
-                },
-                Threads::Workgroups([groups * instance_count, 1, 1]),
-            )?;
-        }
-        Ok(())
     }
 }

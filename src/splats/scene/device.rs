@@ -64,20 +64,20 @@ pub struct DeviceGaussians {
     pub origin: DVec3,
     /// As they were uploaded; `None` where they were not, or there is none.
     #[doc(hidden)]
-    pub bounds: Option<Bounds>,
+    pub bounds: Option<GaussianBounds>,
 }
 
 /// The extent of Gaussians.
 #[doc(hidden)]
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Bounds {
+pub struct GaussianBounds {
     /// Corners of the box of the means.
     pub(crate) corners: [Vec3; 2],
     /// The greatest standard deviation.
     pub(crate) deviation: f32,
 }
 
-impl Bounds {
+impl GaussianBounds {
     fn new(gaussians: &Gaussians) -> Option<Self> {
         let first = *gaussians.means().first()?;
         let corners = gaussians
@@ -168,7 +168,7 @@ impl Gaussians {
         let mut gaussians =
             DeviceGaussians::uninit(gpu, Layout::new(self.count, self.shape, sh_rest))?;
         gaussians.origin = self.origin;
-        gaussians.bounds = Bounds::new(self);
+        gaussians.bounds = GaussianBounds::new(self);
         gaussians.write(gpu, &self.parameters)?;
         Ok(gaussians)
     }

@@ -51,9 +51,9 @@ fn drawn(
     let color = picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE);
     let target = Target { color: Some(&color), is_display_referred: true, ..Target::default() };
     let commands = host.begin();
-    let place = HostFrame { commands: commands.as_raw(), number: frame, readers: 0 };
+    let recorded = HostFrame { commands: commands.as_raw(), number: frame, readers: 0 };
     // SAFETY: the command buffer is recording, outside a render pass.
-    unsafe { gpu.record_into(&place, |pass| draw(pass, &target)) }.unwrap();
+    unsafe { gpu.record_into(&recorded, |pass| draw(pass, &target)) }.unwrap();
     host.submit_frame(commands, frame);
     host.wait_frame(frame);
     let words = host.read_layer(&picture, 0, 2 * PIXELS);
