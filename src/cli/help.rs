@@ -8,12 +8,13 @@ use super::Cli;
 use crate::train::{TrainConfig, values};
 
 /// The options of a command that `-h` shows; of a command that is not listed it shows all.
-const COMMON: [(&str, &str); 9] = [
+const COMMON: [(&str, &str); 10] = [
     ("train", "out resume overwrite preset steps curve downscale max-vram device view explain"),
     ("sweep", "out curves presets seeds grid table steps downscale jobs dry-run"),
     ("check", "json steps curve parts downscale device"),
     ("pose", "out matcher fps camera-model colmap overwrite device"),
     ("render", "out split path frames video size layer format dataset device"),
+    ("export", "format out up level max-size views title text url dataset device"),
     ("apply", "out curve gain brightness reference report compare format json device"),
     ("fit", "normal family out cross-validate plot profile json"),
     ("synth", "street views width height seed fisheye lamp sky street-lamp night-mode overwrite"),

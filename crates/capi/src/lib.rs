@@ -8,6 +8,7 @@
 //! - `device`: a host's device, lent
 //! - `model`: Gaussians on it
 //! - `camera`: cameras, also from an engine's matrices
+//! - `instance`: models of a render of several
 //! - `render`: renders recorded into a host's images
 //! - `train`: training on it
 
@@ -16,6 +17,7 @@
 pub mod camera;
 pub mod device;
 pub mod error;
+pub mod instance;
 pub mod model;
 pub mod render;
 pub mod structs;

@@ -29,6 +29,20 @@ impl NspModel {
     }
 }
 
+/// Whether colours are raw, the alpha limit, and antialiasing: what models of one render have in common.
+pub(super) type Appearance = (bool, f32, bool);
+
+pub(super) fn appearance(model: &Model) -> Appearance {
+    (model.raw_colors, model.max_alpha, model.antialiased)
+}
+
+pub(super) fn check_device(gpu: &Gpu, on_device: &DeviceGaussians) -> Result<(), Failure> {
+    match on_device.parameters.is_on(gpu) {
+        true => Ok(()),
+        false => Err(Failure::usage("the model is on another device; load it with this one")),
+    }
+}
+
 /// The properties of a model.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]

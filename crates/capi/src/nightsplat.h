@@ -26,6 +26,12 @@
 // The lens is a fisheye (Kannala and Brandt); otherwise the camera is a pinhole.
 #define NSP_CAMERA_FISHEYE 1
 
+// The instance is not drawn.
+#define NSP_INSTANCE_HIDDEN 1
+
+// Splats whose centres are outside of `clip_min` to `clip_max` are not drawn.
+#define NSP_INSTANCE_CLIP 2
+
 // Blends over the contents of `color` instead of replacing them.
 #define NSP_RENDER_OVER 1
 
@@ -45,12 +51,6 @@
 // Renders the colours of the dark photographs, by inverting the tone law that the model states: linear light in a
 // linear image, encoded values otherwise. `background` is not changed.
 #define NSP_RENDER_PHOTOGRAPH 32
-
-// The instance is not drawn.
-#define NSP_INSTANCE_HIDDEN 1
-
-// Splats whose centres are outside of `clip_min` to `clip_max` are not drawn.
-#define NSP_INSTANCE_CLIP 2
 
 // A device. Any thread may use it.
 typedef struct NspDevice NspDevice;

@@ -6,9 +6,7 @@ pub use ash::vk::{
     AccessFlags2 as VkAccessFlags2, Extent2D as VkExtent2D, Format as VkFormat, Image as VkImage,
     ImageLayout as VkImageLayout, PipelineStageFlags2 as VkPipelineStageFlags2,
 };
-use glam::{DAffine3, DVec3};
 use nightsplat::gpu::{Gpu, HostFrame, HostImage, ImageFormat, ImageState};
-use nightsplat::splats::model::Model;
 use nightsplat::splats::render::{
     DepthConvention, DepthKind, Instance, Purpose, RenderOptions, RenderSettings, Renderer,
     SceneDepth, Target,
@@ -16,12 +14,12 @@ use nightsplat::splats::render::{
 use nightsplat::splats::scene::MAX_SH_DEGREE;
 use nightsplat_core::camera::Camera;
 
-use super::camera::{NspCamera, affine};
+use super::camera::NspCamera;
 use super::device::{NspDevice, VkCommandBuffer};
 use super::error::{Failure, NspResult, Object, guard};
-use super::model::{LoadedModel, NspModel};
+use super::instance::{NspInstance, lent_instance};
+use super::model::{Appearance, LoadedModel, NspModel, appearance, check_device};
 use super::structs::{Sized0, destroy, give, object, object_mut, read, read_all, write};
-use super::train::{NspTrainer, live};
 
 /// A renderer: compiled kernels, and memory that grows with the views. Use it from one thread at a time.
 #[derive(Debug)]
@@ -34,7 +32,7 @@ struct Shown {
     sh_degree: u32,
     /// Of the model that it was made for, as below.
     gaussian_count: usize,
-    appearance: (bool, f32, bool),
+    appearance: Appearance,
 }
 
 /// The state of an image before or after a recording.
@@ -107,45 +105,6 @@ const FLAGS: u32 = NSP_RENDER_OVER
     | NSP_DEPTH_REVERSED
     | NSP_DEPTH_LINEAR
     | NSP_DEPTH_EXPECTED;
-
-/// The instance is not drawn.
-pub const NSP_INSTANCE_HIDDEN: u32 = 1;
-/// Splats whose centres are outside of `clip_min` to `clip_max` are not drawn.
-pub const NSP_INSTANCE_CLIP: u32 = 2;
-
-/// A model in a render of several. One model can have many instances; it is uploaded once.
-#[repr(C)]
-#[derive(Clone, Copy, Debug)]
-pub struct NspInstance {
-    /// `sizeof(NspInstance)`; in an array, the distance between elements.
-    pub struct_size: usize,
-    /// The model; NULL with a trainer.
-    pub model: *const NspModel,
-    /// A trainer whose Gaussians are drawn as they are, without a copy: the recording is submitted before the next call
-    /// of `nsp_trainer_advance`, to the same queue. NULL: a model.
-    pub trainer: *const NspTrainer,
-    /// The rigid transform from the model's world to that of the cameras, three rows of four; all zeros: none.
-    pub pose: [f64; 12],
-    /// The factor on lengths of the model, before the pose; 0 stands for 1.
-    pub scale: f64,
-    /// Factors of display-referred red, green and blue, 0 or more, and of the opacity, 0 to 1; all zeros stand for
-    /// ones.
-    pub tint: [f32; 4],
-    /// The least corner of the clip box, in the model's world.
-    pub clip_min: [f64; 3],
-    /// The greatest corner of the clip box.
-    pub clip_max: [f64; 3],
-    /// `NSP_INSTANCE_*`.
-    pub flags: u32,
-    /// Unused.
-    pub reserved: u32,
-}
-
-// SAFETY: the size comes first; null pointers are zeros.
-unsafe impl Sized0 for NspInstance {
-    const NAME: &'static str = "NspInstance";
-    const FIRST_SIZE: usize = size_of::<Self>();
-}
 
 /// The parameters of a render.
 #[repr(C)]
@@ -249,21 +208,6 @@ pub unsafe extern "C" fn nsp_renderer_create(
             })
         }
     })
-}
-
-/// What models of one render have in common.
-fn appearance(model: &Model) -> (bool, f32, bool) {
-    (model.raw_colors, model.max_alpha, model.antialiased)
-}
-
-fn check_device(
-    gpu: &Gpu,
-    on_device: &nightsplat::splats::scene::DeviceGaussians,
-) -> Result<(), Failure> {
-    match on_device.parameters.is_on(gpu) {
-        true => Ok(()),
-        false => Err(Failure::usage("the model is on another device; load it with this one")),
-    }
 }
 
 /// Allocates memory for views of this size and for this many intersections, ahead of the first recording.
@@ -417,54 +361,13 @@ unsafe fn models<'a>(
                 _ => unsafe { read_all(instances, instance_count) }?,
             };
             // SAFETY: as the caller promises.
-            let each = |(at, instance)| unsafe { lent_instance(shown, at, instance) };
+            let each = |(at, instance)| unsafe {
+                lent_instance(&shown.gpu, shown.appearance, at, instance)
+            };
             Ok(Models::Instances(all.iter().enumerate().map(each).collect::<Result<_, _>>()?))
         }
         _ => Err(Failure::usage("both a model and NspRender::instances; pass one of them")),
     }
-}
-
-/// # Safety
-/// The model is NULL or valid.
-unsafe fn lent_instance<'a>(
-    shown: &Shown,
-    at: usize,
-    instance: &NspInstance,
-) -> Result<Instance<'a>, Failure> {
-    const FLAGS: u32 = NSP_INSTANCE_HIDDEN | NSP_INSTANCE_CLIP;
-    if instance.flags & !FLAGS != 0 || instance.reserved != 0 {
-        let text = format!("instance {at} has unknown flags, or reserved is not 0");
-        return Err(Failure::usage(text));
-    }
-    // SAFETY: as the caller promises.
-    let whole = match unsafe { instance.trainer.as_ref() } {
-        Some(trainer) => live(trainer)?,
-        None => {
-            // SAFETY: as the caller promises.
-            let model = unsafe { object(instance.model, &format!("the model of instance {at}")) }?;
-            let LoadedModel { model, on_device } = model.0.get("a model")?;
-            if appearance(model) != shown.appearance {
-                return Err(Failure::usage(format!(
-                    "the model of instance {at} has other colours, alpha limit or antialiasing than the renderer's"
-                )));
-            }
-            Instance::new(on_device)
-        }
-    };
-    check_device(&shown.gpu, whole.gaussians)?;
-    let corners = [instance.clip_min, instance.clip_max].map(DVec3::from);
-    let pose = if instance.pose == [0.0; 12] { DAffine3::IDENTITY } else { affine(&instance.pose) };
-    let scale = if instance.scale == 0.0 { 1.0 } else { instance.scale };
-    // That of a trainer takes its frame to the world first.
-    let offset = DAffine3::from_translation(scale * whole.pose.translation);
-    Ok(Instance {
-        pose: pose * offset,
-        scale: scale * whole.scale,
-        tint: if instance.tint == [0.0; 4] { [1.0; 4] } else { instance.tint },
-        clip: (instance.flags & NSP_INSTANCE_CLIP != 0).then_some(corners),
-        is_visible: instance.flags & NSP_INSTANCE_HIDDEN == 0,
-        ..whole
-    })
 }
 
 /// # Safety

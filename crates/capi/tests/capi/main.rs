@@ -30,6 +30,7 @@ use nightsplat_capi::camera::{NspCamera, nsp_camera_from_matrices};
 use nightsplat_capi::device::*;
 use nightsplat_capi::error::panics::panic_in;
 use nightsplat_capi::error::*;
+use nightsplat_capi::instance::*;
 use nightsplat_capi::model::*;
 use nightsplat_capi::render::*;
 use nightsplat_capi::train::*;
