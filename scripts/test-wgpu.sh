@@ -17,14 +17,17 @@ awk 'BEGIN {
     for (k = 1; k <= 14; k++) print "property float " names[k]
     print "end_header"
     for (i = 0; i < count; i++) {
-        for (k = 1; k <= 14; k++) printf "%.4f ", (k <= 3 ? 2 * rand() - 1 : k <= 6 ? 2 * rand() - 0.5 : k == 7 ? rand() : k <= 10 ? -3 + rand() : 0.1 + rand())
-        print ""
+        for (k = 1; k <= 3; k++) printf "%.4f ", 2 * rand() - 1
+        for (k = 4; k <= 6; k++) printf "%.4f ", 2 * rand() - 0.5
+        printf "%.4f %.4f %.4f %.4f ", rand(), rand() - 3, rand() - 3, rand() - 3
+        print 0.1 + rand(), 0.1 + rand(), 0.1 + rand(), 0.1 + rand()
     }
 }' > "$folder/model.ply"
 export VK_INSTANCE_LAYERS=VK_LAYER_KHRONOS_validation
 export VK_LAYER_ENABLES=VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT
 for wall in "" 4; do
-    printed=$("$CARGO_TARGET_DIR/debug/wgpu-host" "$folder/model.ply" "$folder/out.ppm" $wall 2>&1) || { echo "$printed"; exit 1; }
+    printed=$("$CARGO_TARGET_DIR/debug/wgpu-host" "$folder/model.ply" "$folder/out.ppm" $wall 2>&1) ||
+        { echo "$printed" >&2 && exit 1; }
     echo "wall ${wall:-none}: $printed"
     ! grep -q 'Validation\|VUID' <<< "$printed" || { echo "a message of the validation layer" >&2; exit 1; }
     grep -q '^largest difference [01]$' <<< "$printed" || { echo "another picture" >&2; exit 1; }

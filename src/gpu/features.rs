@@ -170,8 +170,8 @@ impl NeededFeature {
     unsafe fn find(&self, at: *mut vk::BaseOutStructure<'_>) -> Option<*mut vk::Bool32> {
         // SAFETY: as the caller promises; the offset is of a member of this type.
         unsafe {
-            let bits = [self.in_version, self.in_extension].into_iter();
-            let bit = bits.filter(|bit| bit.kind == (*at).s_type).next()?;
+            let mut bits = [self.in_version, self.in_extension].into_iter();
+            let bit = bits.find(|bit| bit.kind == (*at).s_type)?;
             Some(at.cast::<u8>().add(bit.offset).cast())
         }
     }

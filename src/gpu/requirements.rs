@@ -176,14 +176,14 @@ mod tests {
             }),
             ("timelineSemaphore", |o| o.features.timeline_semaphore.timeline_semaphore = vk::FALSE),
             ("scalarBlockLayout", |o| {
-                o.features.scalar_block_layout.scalar_block_layout = vk::FALSE
+                o.features.scalar_block_layout.scalar_block_layout = vk::FALSE;
             }),
             ("synchronization2", |o| o.features.synchronization2.synchronization2 = vk::FALSE),
             ("subgroupSizeControl", |o| {
-                o.features.subgroup_size_control.subgroup_size_control = vk::FALSE
+                o.features.subgroup_size_control.subgroup_size_control = vk::FALSE;
             }),
             ("computeFullSubgroups", |o| {
-                o.features.subgroup_size_control.compute_full_subgroups = vk::FALSE
+                o.features.subgroup_size_control.compute_full_subgroups = vk::FALSE;
             }),
             ("subgroup operations", |o| o.subgroup_operations = vk::SubgroupFeatureFlags::BASIC),
             ("subgroup size", |o| o.subgroups.default = 2),

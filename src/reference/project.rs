@@ -324,7 +324,7 @@ impl Reference for Kernel {
             let scene =
                 ProjectionInputs::new(params, constants, slices.cameras, slices.lamp, instance);
             let (planes, floats) = scene.planes.floats(parameters, constants.half_rest);
-            let whole = Kernel::INTERFACE.workgroup_size[0] as usize;
+            let whole = Self::INTERFACE.workgroup_size[0] as usize;
             let count = scene.planes.count;
             for k in 0..if constants.instances { count.next_multiple_of(whole) } else { count } {
                 let i = scene.first + k;

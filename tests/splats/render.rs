@@ -485,5 +485,8 @@ fn only_the_given_gaussians_are_rendered_however_many_are_reserved() {
     assert!(render(&mut renderer, &subset) == expected && all != expected);
     let too_many = setup.gaussians().upload(&gpu).unwrap();
     let refused = alone().render_image(&too_many, &setup.camera, &setup.options).unwrap_err();
-    assert_eq!(refused.to_string(), "100 Gaussians exceed the 10 that the renderer reserved");
+    assert_eq!(
+        refused.to_string(),
+        "100 Gaussians exceed the 10 that the renderer has; call `Renderer::reserve`"
+    );
 }

@@ -1,6 +1,6 @@
 //! A model in a wgpu texture: `wgpu-host MODEL.ply OUT.ppm [WALL]`. wgpu opens its device as ever, with a callback; the
-//! library records into wgpu's own command buffers, over what wgpu drew and hidden by its depth. With WALL, wgpu draws a
-//! wall at that depth into the left half. Prints how far the picture is from a device of the library's own.
+//! library records into wgpu's own command buffers, over what wgpu drew and hidden by its depth. With WALL, wgpu draws
+//! a wall at that depth into the left half. Prints how far the picture is from a device of the library's own.
 
 mod host;
 
@@ -72,7 +72,8 @@ fn draw(host: &Host, model: &Model, wall: Option<f32>) -> Result<Vec<u8>, Box<dy
     Ok(pixels)
 }
 
-/// Of the bytes from those of the same camera on a device of the library's own; where there is a wall, in the right half.
+/// Of the bytes from those of the same camera on a device of the library's own; where there is a wall, in the right
+/// half.
 fn largest_difference(model: &Model, pixels: &[u8], has_wall: bool) -> nightsplat::Result<u8> {
     let gpu = Gpu::new(&DeviceChoice::Best)?;
     let camera = camera(model);
