@@ -29,7 +29,7 @@ pub struct NspCamera {
     pub flags: u32,
     /// Unused.
     pub reserved: u32,
-    /// With `NSP_CAMERA_FISHEYE`: k1 to k4 of OpenCV's fisheye model.
+    /// With `NSP_CAMERA_FISHEYE`: k1 to k4 of its model, as in `OpenCV`.
     pub distortion: [f64; 4],
 }
 

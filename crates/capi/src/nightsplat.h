@@ -171,7 +171,7 @@ typedef struct NspCamera {
     uint32_t flags;
     // Unused.
     uint32_t reserved;
-    // With `NSP_CAMERA_FISHEYE`: k1 to k4 of OpenCV's fisheye model.
+    // With `NSP_CAMERA_FISHEYE`: k1 to k4 of its model, as in `OpenCV`.
     double distortion[4];
 } NspCamera;
 

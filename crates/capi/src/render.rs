@@ -346,8 +346,8 @@ unsafe fn models<'a>(
 ) -> Result<Models<'a>, Failure> {
     let NspRender { instances, instance_count, .. } = *render;
     match (model.is_null(), instances.is_null()) {
-        // SAFETY: as the caller promises.
         (false, true) if instance_count == 0 => {
+            // SAFETY: as the caller promises.
             let model = unsafe { object(model, "model") }?;
             let loaded = model.0.get("the model")?;
             check_device(&shown.gpu, &loaded.on_device)?;
