@@ -15,7 +15,7 @@ use gpu_allocator::MemoryLocation;
 
 use super::allocated::DeviceMemory;
 use super::lent::{HostDevice, HostFrame, QueueLock};
-use super::recorder::Recorder;
+use super::recorder::{HOST_SUBMITS, Recorder};
 use super::{Bound, Gpu, GpuShared, lock};
 use crate::{Error, Result};
 
@@ -56,7 +56,8 @@ pub(super) enum Upload {
 
 /// The uploads of a recording.
 struct RecordedUploads {
-    frame: u64,
+    /// Of the host's; `None`: of a submission of our own, which is not dropped.
+    frame: Option<u64>,
     uploads: Vec<Upload>,
     /// A word on the host that the recording sets to 1: a frame that is done may never have been submitted.
     has_run: DeviceMemory,
@@ -173,18 +174,21 @@ impl GpuShared {
         }
         let uploads = std::mem::take(&mut *lock(&host.uploads));
         uploads.iter().for_each(|upload| upload.record(recorder));
-        let (mark, frame) = (has_run.bound(), self.last_frame());
+        let mark = has_run.bound();
+        let frame = (recorder.value() == HOST_SUBMITS).then(|| self.last_frame());
         // In the list while `record` runs, which may drop a buffer.
         lock(&host.recorded).push(RecordedUploads { frame, uploads, has_run });
         let done = record(recorder);
-        if done.is_ok() {
+        if done.is_ok() && frame.is_some() {
             recorder.fill_raw(mark, 1);
             recorder.leave_for_host();
             return done;
         }
         let is_this = |them: &mut RecordedUploads| them.has_run.handle() == mark.raw;
-        let failed: Vec<_> = lock(&host.recorded).extract_if(.., is_this).collect();
-        host.requeue(failed.into_iter().flat_map(|them| them.uploads).collect());
+        let settled: Vec<_> = lock(&host.recorded).extract_if(.., is_this).collect();
+        if done.is_err() {
+            host.requeue(settled.into_iter().flat_map(|them| them.uploads).collect());
+        }
         done
     }
 
@@ -192,12 +196,13 @@ impl GpuShared {
     fn settle_uploads(&self) {
         let Some(host) = &self.host else { return };
         let reached = self.frames_reached();
-        let settled: Vec<_> =
-            lock(&host.recorded).extract_if(.., |them| them.frame <= reached).collect();
+        let settled: Vec<_> = lock(&host.recorded)
+            .extract_if(.., |them| them.frame.is_some_and(|frame| frame <= reached))
+            .collect();
         let mut dropped = vec![];
         for mut them in settled {
             if !them.have_run() {
-                let frame = them.frame;
+                let frame = them.frame.unwrap_or_default();
                 tracing::warn!("frame {frame} was not submitted; its uploads are part of the next");
                 dropped.append(&mut them.uploads);
             }
