@@ -17,7 +17,7 @@ use super::descriptors::Descriptors;
 use super::device_report::{device_memory, driver_name, report};
 #[cfg(debug_assertions)]
 use super::faults::Faults;
-use super::features::{FullSubgroups, check_enabled};
+use super::features::{FeatureStructs, FullSubgroups, check_enabled, require_features};
 use super::functions::{CoreVersion, host_device, host_instance};
 use super::host::Host;
 use super::instance::{
@@ -422,19 +422,6 @@ fn properties(
 /// (`LP_MAX_TGSI_LOOP_ITERATIONS`).
 const LLVMPIPE_LOOP_ITERATIONS: u32 = 65_535;
 
-/// The features that a device of our own is created with.
-pub(super) fn own_features()
--> (vk::PhysicalDeviceVulkan12Features<'static>, vk::PhysicalDeviceVulkan13Features<'static>) {
-    let vulkan12 = vk::PhysicalDeviceVulkan12Features::default()
-        .timeline_semaphore(true)
-        .scalar_block_layout(true);
-    let vulkan13 = vk::PhysicalDeviceVulkan13Features::default()
-        .synchronization2(true)
-        .subgroup_size_control(true)
-        .compute_full_subgroups(true);
-    (vulkan12, vulkan13)
-}
-
 fn create_device(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
@@ -452,7 +439,8 @@ fn create_device(
     };
     let optional = OPTIONAL_EXTENSIONS.iter().copied().filter(is_wanted);
     let mut extensions: Vec<_> = optional.map(CStr::as_ptr).collect();
-    let (mut vulkan12, mut vulkan13) = own_features();
+    let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default();
+    let mut vulkan13 = vk::PhysicalDeviceVulkan13Features::default();
     let mut matrices =
         vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);
     let mut halves =
@@ -479,11 +467,13 @@ fn create_device(
         extensions.push(statistics::EXTENSION.as_ptr());
         info = info.push_next(&mut executables);
     }
-    let info =
+    let mut info =
         info.enabled_extension_names(&extensions).push_next(&mut vulkan12).push_next(&mut vulkan13);
+    let mut structs = FeatureStructs::default();
     let device = supported.device_name();
     // SAFETY: `info` points at live locals; the requirements were checked.
     unsafe {
+        require_features((&raw mut info).cast(), &mut structs, &[]);
         let device = instance
             .create_device(physical, &info, None)
             .map_err(|result| vulkan_error("vkCreateDevice", device, result))?;

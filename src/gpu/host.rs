@@ -195,6 +195,9 @@ impl GpuShared {
     /// Frees the uploads that the device has run. Those of a recording that was dropped wait for the next one.
     fn settle_uploads(&self) {
         let Some(host) = &self.host else { return };
+        if lock(&host.recorded).is_empty() {
+            return;
+        }
         let reached = self.frames_reached();
         let settled: Vec<_> = lock(&host.recorded)
             .extract_if(.., |them| them.frame.is_some_and(|frame| frame <= reached))

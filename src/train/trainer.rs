@@ -264,20 +264,8 @@ impl Trainer {
 
     /// The settings of a renderer that draws [`Trainer::live`].
     pub fn live_settings(&self) -> RenderSettings {
-        let shown = Gaussians::zeros(0, self.model.gaussians.shape());
-        let RenderSettings { near, max_alpha, raw_colors, antialiased, law, .. } =
-            self.model_of(&shown).render_settings();
-        let shape = self.model.gaussians.shape();
-        RenderSettings {
-            near,
-            max_alpha,
-            raw_colors,
-            antialiased,
-            law,
-            shape,
-            purpose: Purpose::Show,
-            ..RenderSettings::default()
-        }
+        let none = Gaussians::zeros(0, self.model.gaussians.shape());
+        RenderSettings { purpose: Purpose::Show, ..self.model_of(&none).render_settings() }
     }
 
     /// Trains one step with every pass checked; a difference is an error or a warning, as configured.
