@@ -31,9 +31,9 @@ def test_a_photograph_without_light_or_number_is_refused(device):
 
 
 def test_a_diagnosis_is_that_of_the_command(command, room, device):
-    assert nightsplat.diagnose(room, device=device) == command.json("diagnose", room)
-    half = nightsplat.diagnose(room, device=device, preset="fast", downscale=2)
-    assert half == command.json("diagnose", room, "--preset", "fast", "--downscale", "2")
+    found = nightsplat.diagnose(room, device=device, preset="fast", downscale=2)
+    assert found == command.json("diagnose", room, "--preset", "fast", "--downscale", "2")
+    assert found["device"] == device.name and len(found["views"]) == 14
 
 
 def test_an_image_is_saved_as_it_is_read(tmp_path):

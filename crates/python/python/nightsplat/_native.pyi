@@ -9,6 +9,40 @@ import numpy.typing as npt
 
 from ._camera import Camera
 
+__all__ = [
+    "Dataset",
+    "Device",
+    "DeviceError",
+    "DeviceLostError",
+    "DisagreesError",
+    "Error",
+    "InputError",
+    "Lpips",
+    "Model",
+    "NotFiniteError",
+    "OutOfMemoryError",
+    "OutputError",
+    "Render",
+    "Renderer",
+    "SettingError",
+    "Step",
+    "TileLimitError",
+    "Training",
+    "UsageError",
+    "View",
+    "VulkanError",
+    "__version__",
+    "check_camera",
+    "diagnose",
+    "load_image",
+    "psnr",
+    "save_image",
+    "ssim",
+    "synthetic_dataset",
+    "tone_map",
+    "train",
+]
+
 __version__: Final[str]
 
 _Path = str | PathLike[str]
