@@ -53,6 +53,9 @@ pub struct EvalArgs {
     /// Input range of the LPIPS network; scores of different ranges or networks do not compare
     #[arg(long, value_name = "RANGE", value_enum, default_value_t, requires = "lpips")]
     pub lpips_range: LpipsRange,
+    /// Add SSIM with a uniform window of 7x7 and sample covariances, as scikit-image's default and RealX3D's tables
+    #[arg(long)]
+    pub uniform_ssim: bool,
     /// Write renders and references (or targets) to RUN/eval; of MODEL.ply, to MODEL.eval
     #[arg(long)]
     pub save_images: bool,
@@ -101,6 +104,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         downscale: args.downscale,
         opener: opener(args.device.as_ref()),
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),
+        uniform_ssim: args.uniform_ssim,
         align: args.align,
         photographs: args.photographs,
         images: images.as_deref(),

@@ -1,6 +1,7 @@
 //! Scores a model on the test views of its dataset: against their reference images or, without any, against their
 //! targets.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -172,9 +173,19 @@ pub struct ScoredImages<'a> {
 impl ScoredImages<'_> {
     /// LPIPS of the unmasked pixels.
     pub fn lpips(&self, gpu: &Gpu, lpips: &Lpips) -> Result<f64> {
+        lpips.distance(gpu, &self.counted(), &self.target)
+    }
+
+    /// SSIM of the unmasked pixels, with a uniform window.
+    fn ssim_uniform(&self) -> Result<f64> {
+        metrics::ssim_uniform(&self.counted(), &self.target)
+    }
+
+    /// The render with the target at masked pixels.
+    fn counted(&self) -> Cow<'_, Image> {
         let Self { view, render, target, .. } = self;
         let mask = view.mask.as_ref().map(|mask| mask.resized(render.width, render.height));
-        lpips.distance(gpu, &metrics::counted(render, target, mask.as_deref()), target)
+        metrics::counted(render, target, mask.as_deref())
     }
 
     /// The scores of the render by some stops of linear light brighter.
@@ -311,6 +322,8 @@ impl ModelRenderer {
 pub(crate) struct Extras<'a> {
     /// LPIPS of the renders, and the device of its network.
     pub(crate) lpips: Option<(&'a Lpips, &'a Gpu)>,
+    /// SSIM with a uniform window.
+    pub(crate) uniform_ssim: bool,
     /// The renders after the least-squares gain and bias of each channel.
     pub(crate) with_gain_and_bias: bool,
     /// The exposures of views by name: stops relative to the mean of the training views.
@@ -373,6 +386,9 @@ impl Evaluation {
             self.add(name, &images.exposed(*stops)?, against, After::OwnExposure);
         }
         let mut values = vec![];
+        if extras.uniform_ssim {
+            values.push((Metric::SsimUniform, images.ssim_uniform()?));
+        }
         if let Some((lpips, gpu)) = extras.lpips {
             values.push((Metric::Lpips, images.lpips(gpu, lpips)?));
         }

@@ -38,6 +38,8 @@ pub(crate) struct EvalOptions<'a> {
     pub(crate) opener: Opener,
     /// The weights and the input range of LPIPS.
     pub(crate) lpips: Option<(&'a Path, Range)>,
+    /// Whether SSIM with a uniform window is added.
+    pub(crate) uniform_ssim: bool,
     /// Whether scores after gain and bias are added.
     pub(crate) align: bool,
     /// Whether scores of the renders as photographs are added.
@@ -78,6 +80,7 @@ impl RunEvaluation {
         let scene = options.photographs.then(|| SceneTone::measure(&config.tone, &dataset));
         let extras = Extras {
             lpips: lpips.as_ref().map(|lpips| (lpips, &gpu)),
+            uniform_ssim: options.uniform_ssim,
             with_gain_and_bias: options.align || config.exposure.learn,
             scene: scene.transpose()?,
             stops: known_stops(&dataset, &config)?,

@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 use nightsplat::kernels;
 use nightsplat::networks::lpips::Network;
 use nightsplat_photographs::image::{Image, ImageFile};
-use nightsplat_photographs::metrics::Scores;
+use nightsplat_photographs::metrics::{self, Scores};
 use serde_json::Value;
 
 mod blocks;
@@ -196,6 +196,22 @@ fn eval_agrees_with_train_and_saves_the_scored_images() {
     let mean = format!("{:.2}", trained["mean"]["psnr"].as_f64().unwrap());
     assert!(lines[3].starts_with("mean") && lines[3].contains(&mean), "{table}");
     assert!(lines[..4].iter().all(|line| line.len() == lines[0].len()), "not aligned:\n{table}");
+}
+
+#[test]
+fn eval_adds_ssim_with_a_uniform_window_on_request() {
+    let fixture = fixture();
+    let eval = format!("eval {} --uniform-ssim", fixture.run());
+    let scores: Value =
+        serde_json::from_str(&succeed(&format!("{eval} --json --save-images"))).unwrap();
+    for name in ["000", "008"] {
+        let path = |kind: &str| fixture.path("run").join("eval").join(kind).join(name);
+        let load = |kind: &str| Image::load(path(kind).with_extension("png")).unwrap();
+        let expected = metrics::ssim_uniform(&load("renders"), &load("references")).unwrap();
+        let scored = scores["views"][name]["ssim_uniform"].as_f64().unwrap();
+        assert!((scored - expected).abs() < 1e-4, "{name}: {scored}, not {expected}");
+    }
+    assert!(succeed(&eval).lines().next().unwrap().contains("SSIM, uniform"));
 }
 
 #[test]

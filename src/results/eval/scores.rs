@@ -17,6 +17,8 @@ pub enum Metric {
     PsnrChannelMean,
     /// Mean structural similarity.
     Ssim,
+    /// Mean structural similarity with a uniform window of 7x7 and sample covariances.
+    SsimUniform,
     /// LPIPS.
     Lpips,
     /// The share of the background that shows through, the mean over the unmasked pixels.
@@ -32,6 +34,8 @@ pub enum Metric {
 impl Metric {
     /// Those that compare two images.
     const OF_IMAGES: [Self; 3] = [Self::Psnr, Self::PsnrChannelMean, Self::Ssim];
+    /// Those of the model's own renders.
+    const OF_MODEL: [Self; 4] = [Self::Psnr, Self::PsnrChannelMean, Self::Ssim, Self::SsimUniform];
     /// Those of the background.
     const OF_BACKGROUND: [Self; 2] = [Self::ResidualTransmittance, Self::ResidualTransmittanceQ99];
 
@@ -41,6 +45,7 @@ impl Metric {
             Self::Psnr => "psnr",
             Self::PsnrChannelMean => "psnr_channel_mean",
             Self::Ssim => "ssim",
+            Self::SsimUniform => "ssim_uniform",
             Self::Lpips => "lpips",
             Self::ResidualTransmittance => "mean",
             Self::ResidualTransmittanceQ99 => "q99",
@@ -176,7 +181,7 @@ impl Evaluation {
     /// `metrics.json`: means, views, and the resources of the run; unknown values are null.
     pub(crate) fn json(&self, seconds: Option<f64>, gaussians: usize, steps: Option<u64>) -> Value {
         let entry = |view: Option<&str>| {
-            let mut entry = self.entry(view, After::Model, &Metric::OF_IMAGES);
+            let mut entry = self.entry(view, After::Model, &Metric::OF_MODEL);
             let before_denoiser = self.entry(view, After::Gaussians, &Metric::OF_IMAGES);
             if !before_denoiser.is_null() {
                 entry["r0"] = before_denoiser;
@@ -259,6 +264,7 @@ impl Evaluation {
             ("PSNR", 2, Metric::Psnr, After::Model),
             ("channel mean", 2, Metric::PsnrChannelMean, After::Model),
             ("SSIM", 4, Metric::Ssim, After::Model),
+            ("SSIM, uniform", 4, Metric::SsimUniform, After::Model),
             (lpips.as_str(), 4, Metric::Lpips, After::Model),
             // R_0 is the render before the denoiser.
             ("PSNR of R_0", 2, Metric::Psnr, After::Gaussians),
