@@ -53,6 +53,20 @@ fn documents_keep_to_their_lengths() {
 }
 
 #[test]
+fn the_site_has_every_document() {
+    let summary = fs::read_to_string(Path::new(ROOT).join("docs/SUMMARY.md")).unwrap();
+    for (path, _) in
+        documents().into_iter().filter(|(path, _)| path.parent().unwrap().ends_with("docs"))
+    {
+        let name = path.file_name().unwrap().to_str().unwrap();
+        assert!(
+            name == "SUMMARY.md" || summary.contains(&format!("({name})")),
+            "docs/SUMMARY.md lacks {name}"
+        );
+    }
+}
+
+#[test]
 fn links_lead_to_files_and_headings_that_exist() {
     for (path, page) in documents() {
         let links = page.split("](").skip(1).filter_map(|rest| rest.split(')').next());
