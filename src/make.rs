@@ -91,6 +91,25 @@ impl MadePaths {
         })
     }
 
+    /// Whether cameras are to be estimated with these options.
+    ///
+    /// # Errors
+    /// There are some of other photographs or options, which are not to be replaced.
+    pub fn needs_cameras(&self, options: &PoseOptions) -> Result<bool> {
+        if !self.stages.contains(&Stage::Cameras) {
+            return Ok(false);
+        }
+        if options.overwrite || !self.dataset.exists() {
+            return Ok(true);
+        }
+        if pose::is_estimated(options) {
+            return Ok(false);
+        }
+        let problem = "holds the cameras of other photographs or options; begin anew with --overwrite, or name another \
+                       --out";
+        Err(Error::output(&self.dataset, problem))
+    }
+
     /// Coarse estimates of the stages that are left, in seconds, with the options of the cameras and the configuration
     /// of the training as far as known; `None` of one that nothing is known of.
     pub fn expected(

@@ -16,8 +16,8 @@ use crate::driver;
 use crate::gpu::DeviceChoice;
 use crate::live;
 use crate::make::{MadePaths, Stage};
-use crate::pose::{PoseOptions, is_estimated};
-use crate::results::run::Requests;
+use crate::pose::PoseOptions;
+use crate::results::run::{Requests, has_checkpoint};
 use crate::{Error, Stop};
 
 /// From photographs to a page: cameras, training, page.
@@ -70,6 +70,10 @@ const EXAMPLES: &str = "Examples:
 /// Runs the stages that are left.
 pub fn run(args: &MakeArgs) -> Result<()> {
     let made = MadePaths::new(&args.photos, args.out.as_deref())?;
+    if args.finish && !has_checkpoint(&made.run) {
+        let problem = "has no checkpoint to finish from; without --finish, the training goes on";
+        return Err(Error::input(&made.run, problem).into());
+    }
     // Misuse ends before hours of work.
     let config = args.options.requested(&made.dataset)?.settings(None)?.config()?;
     config.check()?;
@@ -80,47 +84,79 @@ pub fn run(args: &MakeArgs) -> Result<()> {
         overwrite: args.overwrite,
         ..args.cameras.options(&args.photos, &made.dataset)
     };
-    let needs_cameras = made.stages.contains(&Stage::Cameras) && !is_estimated(&cameras);
-    if needs_cameras && !args.overwrite && made.dataset.exists() {
-        let problem = "holds the cameras of other photographs or options; begin anew with --overwrite, or name another \
-                       --out";
-        return Err(Error::output(&made.dataset, problem).into());
-    }
+    let needs_cameras = made.needs_cameras(&cameras)?;
     let is_cpu = driver::open(&device)?.properties().is_cpu;
-    let is_quiet = args.progress == Some(ProgressForm::None);
-    if !is_quiet {
-        tell_on_stderr(expected(&made.expected(&cameras, &config, is_cpu)));
-    }
+    let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
+    let display = Display { made: &made, times: made.expected(&cameras, &config, is_cpu), form };
+    display.tell_times();
     let requests = signals::requests()?;
-    let prefix = |stage: Stage| {
-        let (at, all) = (made.stages.iter().position(|&one| one == stage), made.stages.len());
-        format!("{} of {all} {}: ", at.map_or(0, |at| at + 1), stage.name())
-    };
-    if needs_cameras || args.overwrite && made.stages.contains(&Stage::Cameras) {
-        tell(one_line(&pose::posed(&cameras, &prefix(Stage::Cameras), &requests)?));
+    if needs_cameras {
+        display.begin(Stage::Cameras);
+        let wrote = pose::posed(&cameras, &display.prefix(Stage::Cameras), &requests)?;
+        if form != ProgressForm::Json {
+            tell(one_line(&wrote));
+        }
         stop_between(&made, &requests)?;
     }
-    train::train(&training(args, &made, prefix(Stage::Training)), Some(&requests))?;
+    display.begin(Stage::Training);
+    train::train(&training(args, &made, display.prefix(Stage::Training)), Some(&requests))?;
     let page = page(args, &made)?;
-    tell(format_args!("{}wrote {}", prefix(Stage::Page), one_line(&page.display().to_string())));
-    match open_page(&page, args.no_open) {
-        true => tell("next: it opens in your browser; send the file to share it"),
-        false => {
-            tell(format_args!("next: open {} in a browser; send the file to share it", word(&page)))
-        }
-    }
+    display.end(&page, open_page(&page, args.no_open));
     Ok(())
 }
 
+/// One display over all stages.
+struct Display<'a> {
+    made: &'a MadePaths,
+    /// Estimates of the stages that are left, in seconds.
+    times: Vec<(Stage, Option<f64>)>,
+    form: ProgressForm,
+}
+
+impl Display<'_> {
+    fn tell_times(&self) {
+        if self.form != ProgressForm::None {
+            tell_on_stderr(expected(&self.times));
+        }
+    }
+
+    /// Begins every line of a stage: "2 of 3 training: ".
+    fn prefix(&self, stage: Stage) -> String {
+        let stages = &self.made.stages;
+        let before = stages.iter().take_while(|&&one| one != stage).count();
+        format!("{} of {} {}: ", before + 1, stages.len(), stage.name())
+    }
+
+    fn begin(&self, stage: Stage) {
+        let time = self.times.iter().find_map(|(of, time)| time.filter(|_| *of == stage));
+        if self.form != ProgressForm::None {
+            let time = time.map_or_else(|| "begins".to_owned(), about);
+            tell_on_stderr(format_args!("{}{time}", self.prefix(stage)));
+        }
+    }
+
+    fn end(&self, page: &Path, opens: bool) {
+        if self.form == ProgressForm::Json {
+            return tell(serde_json::json!({ "event": "page", "path": page, "opens": opens }));
+        }
+        let wrote = format!("{}wrote {}", self.prefix(Stage::Page), page.display());
+        let next = match opens {
+            true => "it opens in your browser".to_owned(),
+            false => format!("open {} in a browser", word(page)),
+        };
+        tell(format_args!("{}\nnext: {next}; send the file to share it", one_line(&wrote)));
+    }
+}
+
 /// The estimates in a line, as coarse as they are.
-fn expected(stages: &[(Stage, Option<f64>)]) -> String {
-    let known: f64 = stages.iter().filter_map(|(_, seconds)| *seconds).sum();
+fn expected(times: &[(Stage, Option<f64>)]) -> String {
+    let known: f64 = times.iter().filter_map(|(_, seconds)| *seconds).sum();
     let part = |(stage, seconds): &(Stage, Option<f64>)| match seconds {
         Some(seconds) => format!("{} {}", stage.name(), about(*seconds)),
         None => format!("{} as its frames need", stage.name()),
     };
-    let parts = stages.iter().map(part).collect::<Vec<_>>().join(", ");
-    let more = if stages.iter().any(|(_, seconds)| seconds.is_none()) { " and more" } else { "" };
+    let parts = times.iter().map(part).collect::<Vec<_>>().join(", ");
+    let more = if times.iter().any(|(_, seconds)| seconds.is_none()) { " and more" } else { "" };
     format!("{}{more} in all, a coarse estimate: {parts}", about(known))
 }
 

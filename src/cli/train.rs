@@ -33,8 +33,8 @@ use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 ///
 /// SIGINT, SIGTERM and SIGHUP save a checkpoint and stop, with exit code 130, 143 or 129; another a second later or
 /// more ends the process at once. Under nohup, SIGHUP does nothing. SIGUSR1 saves a checkpoint and continues, SIGUSR2
-/// lets the run cool down from there, and scores and writes it. --resume continues a run to the same bits; on a finished
-/// run it does nothing.
+/// lets the run cool down from there, and scores and writes it. --resume continues a run to the same bits; on a
+/// finished run it does nothing.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLE)]
 pub struct TrainArgs {

@@ -139,8 +139,8 @@ impl<'a> Reconstruction<'a> {
     /// The folder of the models, each a folder; it is empty if nothing could be reconstructed. If more than a tenth of
     /// the dark photographs have no camera, all are matched again, guided: without it, the result of a small set
     /// depends on chance; always matching guided would double the time of a large one. If most still have none, the
-    /// choice of the initial pair is relaxed. All of this together takes [`PoseOptions::patience`] times the time of the
-    /// first attempt at most. Stages that an earlier call has done are not repeated.
+    /// choice of the initial pair is relaxed. All of this together takes [`PoseOptions::patience`] times the time of
+    /// the first attempt at most. Stages that an earlier call has done are not repeated.
     pub(super) fn models(
         mut self,
         pictures: &PosePhotographs,
@@ -226,8 +226,8 @@ impl<'a> Reconstruction<'a> {
         self.until.is_some_and(|until| until <= Instant::now())
     }
 
-    /// Extracts the features of each photograph into the database, and copies that to `features`: COLMAP matches no pair
-    /// twice, so matching again begins with the features alone. Those of one group share a camera, for which an
+    /// Extracts the features of each photograph into the database, and copies that to `features`: COLMAP matches no
+    /// pair twice, so matching again begins with the features alone. Those of one group share a camera, for which an
     /// interrupted call has to begin anew.
     fn extract(
         &self,

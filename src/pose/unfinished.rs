@@ -34,8 +34,8 @@ pub(super) fn link_or_copy_to(from: &Path, to: &Path) -> Result<()> {
         .map_err(|error| Error::output(to, format!("cannot be written: {error}")))
 }
 
-/// A dataset under a temporary name, with what its programs have found so far. One that a killed process left is gone on
-/// with; one that failed is removed.
+/// A dataset under a temporary name, with what its programs have found so far. Another call goes on with what a killed
+/// process left; what failed is removed.
 pub(super) struct Unfinished {
     target: PathBuf,
     replaces: bool,

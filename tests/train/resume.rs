@@ -171,8 +171,8 @@ fn a_run_that_converges_settles_and_ends_and_so_does_one_that_is_killed_and_resu
     }
 }
 
-/// After a round of density control that it may not repeat, between rounds, in the first step, and where the cooldown has
-/// begun as planned.
+/// After a round of density control that it may not repeat, between rounds, before the first step, and where the
+/// cooldown has begun as planned.
 #[test]
 fn a_run_whose_end_is_requested_cools_down_from_there_and_so_does_one_that_is_killed_and_resumed() {
     let folder = tempfile::tempdir().unwrap();

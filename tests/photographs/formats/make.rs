@@ -75,7 +75,7 @@ fn a_folder_becomes_a_page_by_one_command_that_goes_on_in_every_stage() {
     }
     assert!(!text.contains("error"), "{text}");
 
-    // Killed there: COLMAP outlives it, and nobody else may use its folder.
+    // Killed there: COLMAP outlives it, and no other process may use its folder.
     fs::remove_file(root.join("waits")).unwrap();
     let mut child = started(&line);
     wait_for(&root.join("waits"));
