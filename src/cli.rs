@@ -32,6 +32,7 @@ pub mod eval;
 pub mod export;
 mod help;
 mod hints;
+pub mod make;
 pub mod man;
 mod phases;
 pub mod pose;
@@ -39,6 +40,7 @@ pub mod progress;
 pub mod render;
 mod settings;
 mod signals;
+mod stopped;
 pub mod sweep;
 pub mod synth;
 mod tell;
@@ -50,6 +52,7 @@ mod words;
 
 pub use hints::hint;
 pub use phases::Phases;
+pub use stopped::ending;
 pub use tell::tell_on_stderr;
 use tell::{print, tell};
 
@@ -65,6 +68,7 @@ pub struct Cli {
 }
 
 const EXAMPLES: &str = "Start with:
+  nightsplat photos                                 from a folder of dark photographs to a page to share
   nightsplat demo                                   see it work, without any data
   nightsplat doctor                                 which devices there are
   nightsplat pose photos --out scene                find the cameras of photographs that have none
@@ -94,6 +98,7 @@ Exit codes:
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Make(Box<make::MakeArgs>),
     Train(Box<train::TrainArgs>),
     Diagnose(diagnose::DiagnoseArgs),
     Pose(pose::PoseArgs),
@@ -124,9 +129,13 @@ enum Command {
 
 impl Cli {
     /// Reads a command line, the program's name first.
-    pub fn read(arguments: Vec<OsString>) -> Result<Self, clap::Error> {
+    pub fn read(mut arguments: Vec<OsString>) -> Result<Self, clap::Error> {
         let everything = arguments.iter().any(|argument| argument == "--help-all");
-        Self::from_arg_matches(&help::command(everything).try_get_matches_from(arguments)?)
+        let command = help::command(everything);
+        if let Some(at) = make::place_of_photographs(&command, &arguments) {
+            arguments.insert(at, "make".into());
+        }
+        Self::from_arg_matches(&command.try_get_matches_from(arguments)?)
     }
 
     /// The number of -v flags.
@@ -137,6 +146,7 @@ impl Cli {
     /// Runs the command.
     pub fn run(self) -> Result<()> {
         match self.command {
+            Command::Make(args) => make::run(&args),
             Command::Train(args) => train::run(&args),
             Command::Diagnose(args) => diagnose::run(&args),
             Command::Pose(args) => pose::run(&args),
@@ -162,7 +172,7 @@ impl Cli {
 }
 
 /// The message of an error; settings are named by key and option.
-pub fn message(error: &anyhow::Error) -> String {
+fn message(error: &anyhow::Error) -> String {
     let message = format!("{error:#}");
     let Some(crate::Error::Setting { key, .. }) = error.downcast_ref() else { return message };
     match setting(key).and_then(Setting::option) {

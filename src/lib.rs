@@ -104,6 +104,7 @@
 //! - `results`: runs and their directories, scores, reports, exports
 //! - `blocks`: scenes that outgrow a device
 //! - `live`: the page of a run that a browser shows
+//! - `make`: from photographs to a page, stage by stage
 //! - `bench`: what `nightsplat bench` measures
 //! - `cli`: one file per subcommand
 
@@ -139,6 +140,9 @@ pub mod live;
 #[cfg(feature = "train")]
 #[doc(hidden)]
 pub mod loss;
+#[cfg(feature = "cli")]
+#[doc(hidden)]
+pub mod make;
 #[cfg(feature = "train")]
 #[doc(hidden)]
 pub mod networks;

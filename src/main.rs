@@ -4,7 +4,7 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use nightsplat::Error;
-use nightsplat::cli::{Cli, Phases, event_field, hint, message, one_line, tell_on_stderr};
+use nightsplat::cli::{Cli, Phases, ending, event_field, hint, one_line, tell_on_stderr};
 use tracing_subscriber::filter::{LevelFilter, filter_fn};
 use tracing_subscriber::fmt::format::debug_fn;
 use tracing_subscriber::prelude::*;
@@ -34,7 +34,7 @@ fn main() -> ExitCode {
         .with(phases)
         .init();
     let Err(error) = cli.run() else { return ExitCode::SUCCESS };
-    tell_on_stderr(format_args!("error: {}", one_line(&message(&error))));
+    tell_on_stderr(one_line(&ending(&error)));
     ExitCode::from(error.downcast_ref::<Error>().map_or(1, Error::exit_code))
 }
 

@@ -5,7 +5,10 @@
 
 mod cameras;
 mod clip;
+mod expected;
 mod in_place;
+mod motion;
+mod origin;
 mod pictures;
 mod reconstruction;
 mod stages;
@@ -17,7 +20,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::camera::Lens;
-use nightsplat_core::output::is_same_file;
+use nightsplat_core::output::{about, is_same_file};
 use nightsplat_photographs::dataset::{Dataset, is_mask};
 use nightsplat_photographs::image::StoredLight;
 use nightsplat_photographs::image::files::{photographs_in, stem, unread_in};
@@ -32,7 +35,7 @@ use self::tool::Tool;
 pub use self::tool::how_to_install;
 use self::unfinished::Unfinished;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::{Error, Result};
+use crate::{Error, Result, Stop};
 
 /// The photographs, the dataset to write, and the programs to run.
 #[derive(Clone, Debug)]
@@ -51,6 +54,8 @@ pub struct PoseOptions {
     pub glomap: PathBuf,
     /// Path of ffmpeg, for clips.
     pub ffmpeg: PathBuf,
+    /// Further attempts, where few photographs have a camera, take this many times the time of the first at most.
+    pub patience: f64,
     /// By default sequential for a clip, else exhaustive.
     pub matcher: Option<Matcher>,
     /// The mapper that registers cameras.
@@ -69,6 +74,16 @@ pub struct PoseOptions {
     pub device: DeviceChoice,
     /// How it is opened.
     pub open: fn(&DeviceChoice) -> Result<Gpu>,
+}
+
+/// Who follows [`estimate`].
+#[expect(missing_debug_implementations, reason = "closures have none")]
+#[derive(Clone, Copy)]
+pub struct PoseWatch<'a> {
+    /// Takes the progress.
+    pub report: &'a dyn Fn(PoseProgress<'_>),
+    /// Why the work is to stop, if it is.
+    pub stops: &'a dyn Fn() -> Option<Stop>,
 }
 
 /// Progress of [`estimate`].
@@ -98,37 +113,107 @@ pub struct Posed {
     pub lenses: Vec<Lens>,
 }
 
+/// The folder of the tone-mapped copies, and the mark that they are whole.
+const BRIGHTENED: &str = "tone-mapped";
+
 /// Fewer photographs than this have no reconstruction.
 const MIN_CAMERAS: usize = 3;
 
-/// Estimates the cameras and writes the dataset.
-pub fn estimate(options: &PoseOptions, report: &dyn Fn(PoseProgress<'_>)) -> Result<Posed> {
+/// Estimates the cameras and writes the dataset. A call that was stopped or killed is gone on with by the next one of
+/// the same photographs and options.
+///
+/// # Errors
+/// The photographs or programs cannot be used, few have a camera, or the work is stopped.
+pub fn estimate(options: &PoseOptions, watch: &PoseWatch<'_>) -> Result<Posed> {
     if !(options.fps > 0.0 && options.fps <= 240.0) {
         let problem = format!("--fps is {}; it must be above 0 and at most 240", options.fps);
         return Err(Error::Usage(problem));
     }
-    let is_clip = tree::is_file(&options.photos) && !tree::is_dir(&options.photos);
+    if !(options.patience >= 0.0 && options.patience < 1e6) {
+        let problem = format!("--patience is {}; it must be 0 or above", options.patience);
+        return Err(Error::Usage(problem));
+    }
     check_writable(&options.out)?;
-    let mut out = Unfinished::new(&options.out, options.overwrite)?;
-    let colmap = Tool::new(&options.colmap, "colmap", &out.log)
-        .found(&format!("by hand: {}", by_hand(&options.photos, &options.out)))?;
+    let mut out = Unfinished::open(&options.out, options.overwrite, &origin::of(options))?;
+    let posed = posed(options, &mut out, watch);
+    if posed.as_ref().is_err_and(Error::is_stop) {
+        out.keep();
+    }
+    posed
+}
+
+/// Whether there are cameras at `out`, as [`estimate`] finds them with these options.
+pub fn is_estimated(options: &PoseOptions) -> bool {
+    unfinished::origin_of(&options.out).is_some_and(|of| of == origin::of(options))
+}
+
+/// Seconds that it takes to find cameras with these options, within a factor of two or three; `None` of a clip, whose
+/// frames are not known.
+pub fn expected(options: &PoseOptions) -> Option<f64> {
+    let photographs = photographs_in(&options.photos).ok()?;
+    let with = options.with.as_ref().and_then(|with| photographs_in(with).ok()).unwrap_or_default();
+    let count = photographs.len() + with.len();
+    let matcher = options.matcher.unwrap_or(Matcher::Exhaustive);
+    let seconds = expected::of(count, photographs.first().map(PathBuf::as_path), matcher);
+    Some(seconds.into_iter().sum())
+}
+
+fn posed(
+    options: &PoseOptions,
+    out: &mut Unfinished,
+    PoseWatch { report, stops }: &PoseWatch<'_>,
+) -> Result<Posed> {
+    let is_clip = tree::is_file(&options.photos) && !tree::is_dir(&options.photos);
+    let colmap = Tool::new(&options.colmap, "colmap", out, stops).found()?;
     let matcher = matcher(options, is_clip)?;
-    let reconstruction = Reconstruction::new(options, colmap, matcher, &out.work)?;
+    let reconstruction = Reconstruction::new(options, colmap, matcher, out)?;
     let folder = folder_of(&options.photos)?;
     let bright = options.with.as_deref().map(|with| bright_photographs(with, &folder));
     let bright = bright.transpose()?.unwrap_or_default();
     let dark = if is_clip {
-        let ffmpeg = Tool::new(&options.ffmpeg, "ffmpeg", &out.log).found("")?;
-        clip::frames(&ffmpeg, &options.photos, options.fps, &out.work.join("frames"))?
+        let (folder, done) = (out.work.join("frames"), out.seconds_of("frames").is_some());
+        let frames = if done {
+            photographs_in(&folder)?
+        } else {
+            let _ = std::fs::remove_dir_all(&folder);
+            let ffmpeg = colmap.beside(&options.ffmpeg, "ffmpeg").found()?;
+            clip::frames(&ffmpeg, &options.photos, options.fps, &folder)?
+        };
+        out.done("frames", 0.0)?;
+        if let Some(remark) = motion::short_clip(&options.photos, frames.len(), options.fps) {
+            tracing::warn!("{remark}");
+        }
+        frames
     } else {
         distinct_photographs(&folder)?
     };
-    let gpu = (options.open)(&options.device)?;
-    let [copies, masks] = ["tone-mapped", "masks"].map(|name| out.work.join(name));
+    let [copies, masks] = [BRIGHTENED, "masks"].map(|name| out.work.join(name));
     let mut pictures = PosePhotographs { dark, bright, copies, masks };
-    brighten(&gpu, &mut pictures, options.light, report)?;
-    in_place::mask(&pictures)?;
+    if out.seconds_of(BRIGHTENED).is_some() {
+        pictures.retain_copied();
+        report(PoseProgress::Line("going on where an earlier call was stopped"));
+    } else {
+        let gpu = (options.open)(&options.device)?;
+        brighten(&gpu, &mut pictures, options.light, &|progress| {
+            report(progress);
+            stops().map_or(Ok(()), |cause| Err(out.stopped("brightening", cause)))
+        })?;
+        in_place::mask(&pictures)?;
+        out.done(BRIGHTENED, 0.0)?;
+    }
     let all = pictures.dark.len();
+    let dark_copies: Vec<PathBuf> = pictures.dark.iter().map(|path| pictures.copy(path)).collect();
+    if let Some(remark) = motion::at_rest(&dark_copies) {
+        tracing::warn!("{remark}");
+    }
+    let [features, matches, cameras] = expected::seconds(&pictures, matcher);
+    report(PoseProgress::Line(&format!(
+        "{} in all, coarsely: features {}, matching {}, cameras {}",
+        about(features + matches + cameras),
+        about(features),
+        about(matches),
+        about(cameras)
+    )));
     let models = reconstruction.models(&pictures, report)?;
     let largest = Dataset::largest_model(&models, is_dark)?;
     let has_enough = |(_, names): &(PathBuf, Vec<String>)| {
@@ -206,18 +291,18 @@ fn brighten(
     gpu: &Gpu,
     pictures: &mut PosePhotographs,
     light: Option<StoredLight>,
-    report: &dyn Fn(PoseProgress<'_>),
+    report: &dyn Fn(PoseProgress<'_>) -> Result<()>,
 ) -> Result<()> {
     let PosePhotographs { dark, bright, copies, .. } = pictures;
     let gain = tone_mapped::write(gpu, dark, light, copies, report)?;
     let count = dark.len();
-    report(PoseProgress::Line(&format!("{count} photographs brightened (gain {gain:.1})")));
+    report(PoseProgress::Line(&format!("{count} photographs brightened (gain {gain:.1})")))?;
     if !bright.is_empty() {
         let gain = tone_mapped::write(gpu, bright, None, &copies.join(BRIGHT), report)?;
         let count = bright.len();
         report(PoseProgress::Line(&format!(
             "{count} bright photographs beside them (gain {gain:.1})"
-        )));
+        )))?;
     }
     Ok(())
 }
@@ -265,17 +350,6 @@ fn bright_photographs(with: &Path, dark: &Path) -> Result<Vec<PathBuf>> {
         return Err(Error::input(with, problem));
     }
     distinct_photographs(&bright)
-}
-
-/// The commands to run COLMAP by hand.
-fn by_hand(photos: &Path, out: &Path) -> String {
-    let (photos, out) = (photos.display(), out.display());
-    format!(
-        "nightsplat tone apply {photos} --scene-statistics --out bright && mkdir -p {out}/sparse && colmap \
-         feature_extractor --database_path {out}/database.db --image_path bright --ImageReader.single_camera 1 \
-         && colmap exhaustive_matcher --database_path {out}/database.db && colmap mapper --database_path \
-         {out}/database.db --image_path bright --output_path {out}/sparse && cp -r {photos} {out}/images"
-    )
 }
 
 /// The photographs of a folder.

@@ -13,6 +13,8 @@ use super::{finish, opener, tell, word};
 use crate::Error;
 use crate::gpu::DeviceChoice;
 use crate::results::edit::{EditList, Editor};
+use crate::results::finished_run::is_model;
+use crate::results::run::load_config;
 
 /// Crop, clean, transform and merge models.
 ///
@@ -76,7 +78,15 @@ pub fn run(args: &EditArgs) -> Result<()> {
         editor.save_list(path)?;
         wrote += &format!(", {}", path.display());
     }
-    let next = format!("nightsplat export {} --format html --dataset DIR", word(&args.out));
+    let run = Some(&args.model).filter(|model| !is_model(model));
+    let known = run.and_then(|run| load_config(run).ok()).map(|config| config.dataset);
+    let dataset = args.dataset.clone().or(known);
+    let dataset = dataset.map(|dataset| format!(" --dataset {}", word(&dataset)));
+    let next = format!(
+        "nightsplat export {} --format html{}",
+        word(&args.out),
+        dataset.unwrap_or_default()
+    );
     finish(&wrote, &next);
     Ok(())
 }

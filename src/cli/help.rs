@@ -8,11 +8,18 @@ use super::Cli;
 use crate::train::{TrainConfig, values};
 
 /// The options of a command that `-h` shows; of a command that is not listed it shows all.
-const COMMON: [(&str, &str); 10] = [
-    ("train", "out resume overwrite preset steps curve downscale max-vram device view explain"),
+const COMMON: [(&str, &str); 11] = [
+    (
+        "make",
+        "out title no-open finish overwrite preset downscale max-vram set matcher fps colmap device view progress",
+    ),
+    (
+        "train",
+        "out resume finish overwrite preset steps curve downscale max-vram device view explain",
+    ),
     ("sweep", "out curves presets seeds grid table steps downscale jobs dry-run"),
     ("check", "json steps curve parts downscale device"),
-    ("pose", "out matcher fps camera-model colmap overwrite device"),
+    ("pose", "out matcher fps camera-model patience colmap overwrite device"),
     ("render", "out split path frames video size layer format dataset device"),
     ("export", "format out up level max-size views title text url dataset device"),
     ("apply", "out curve gain brightness reference report compare format json device"),
@@ -60,7 +67,7 @@ fn with_help(command: Command, everything: bool) -> Command {
     let command = command.mut_subcommands(|inner| with_help(inner, everything));
     let name = command.get_name().to_owned();
     let common = COMMON.iter().find(|(listed, _)| *listed == name).map(|(_, options)| *options);
-    let is_training = ["train", "check", "sweep"].contains(&name.as_str());
+    let is_training = ["make", "train", "check", "sweep"].contains(&name.as_str());
     let help = |name: &'static str, text: &'static str| {
         Arg::new(name).long(name).action(ArgAction::HelpShort).help(text).display_order(999)
     };
@@ -138,7 +145,7 @@ mod tests {
         for (_, names) in &GROUPS {
             assert!(names.split(' ').all(|name| options(train).contains(&name)), "{names}");
         }
-        let in_none = ["out", "overwrite", "resume", "help", "help-all"];
+        let in_none = ["out", "overwrite", "resume", "finish", "help", "help-all"];
         let grouped = |name: &&str| {
             in_none.contains(name) || GROUPS.iter().any(|(_, names)| lists(names, name))
         };

@@ -1,6 +1,6 @@
-//! What to type instead of the options of other trainers.
+//! What to type instead of the options of other trainers, and of a path that does not exist.
 
-use clap::error::{ContextKind, ContextValue};
+use clap::error::{ContextKind, ContextValue, ErrorKind};
 
 /// Options of other trainers, with their replacements.
 const OPTIONS: [(&str, &str); 11] = [
@@ -29,8 +29,14 @@ const OPTIONS: [(&str, &str); 11] = [
     ("--format --export-format", "`nightsplat export RUN --format FORMAT` after training"),
 ];
 
-/// The message for a command line with an option of another trainer.
+/// The message for a command line with an option of another trainer, or with a word that is neither command nor path.
 pub fn hint(error: &clap::Error) -> Option<String> {
+    let is_like_none = error.get(ContextKind::SuggestedSubcommand).is_none();
+    if let (ErrorKind::InvalidSubcommand, true, Some(ContextValue::String(word))) =
+        (error.kind(), is_like_none, error.get(ContextKind::InvalidSubcommand))
+    {
+        return Some(format!("there is no command, folder or file `{word}`"));
+    }
     let Some(ContextValue::String(name)) = error.get(ContextKind::InvalidArg) else { return None };
     let (_, ours) =
         OPTIONS.iter().find(|(names, _)| names.split(' ').any(|option| option == name))?;

@@ -4,6 +4,7 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use nightsplat_core::output::duration;
 use serde_json::{Map, Value, json};
 
 use super::{phases, tell, tell_on_stderr};
@@ -57,6 +58,8 @@ fn foreseen(memory: &MemoryEstimate) -> String {
 #[derive(Debug)]
 pub(crate) struct Reporter {
     form: ProgressForm,
+    /// Begins every line and the bar.
+    prefix: String,
     /// Added to the JSON of the start event.
     facts: Value,
     bar: ProgressBar,
@@ -64,20 +67,24 @@ pub(crate) struct Reporter {
     steps: u64,
     /// Whether early stopping may end the run before that.
     may_end_early: bool,
+    /// The last score of the held-out views, dB.
+    held_out: Option<f64>,
     /// Time and step of the start.
     begin: (Instant, u64),
     last_line: Instant,
 }
 
 impl Reporter {
-    pub(crate) fn new(form: ProgressForm) -> Self {
+    pub(crate) fn new(form: ProgressForm, prefix: &str) -> Self {
         let now = Instant::now();
         Self {
             form,
+            prefix: prefix.to_owned(),
             facts: json!({}),
             bar: ProgressBar::hidden(),
             steps: 0,
             may_end_early: false,
+            held_out: None,
             begin: (now, 0),
             last_line: now,
         }
@@ -97,6 +104,7 @@ impl Reporter {
                 (self.begin, self.last_line) = ((now, step), now);
             }
             Event::LastStep { last, .. } => (self.steps, self.may_end_early) = (last, false),
+            Event::HeldOut { psnr, .. } => self.held_out = Some(psnr),
             _ => {}
         }
         match self.form {
@@ -111,7 +119,8 @@ impl Reporter {
         match event {
             Event::Started { step, memory, .. } => {
                 tell_on_stderr(foreseen(memory));
-                self.bar = ProgressBar::new(self.steps).with_position(step);
+                let bar = ProgressBar::new(self.steps).with_position(step);
+                self.bar = bar.with_prefix(self.prefix.clone());
                 self.bar.set_style(style(self.may_end_early));
             }
             Event::LastStep { last, .. } => {
@@ -120,8 +129,7 @@ impl Reporter {
             }
             Event::Step(report) => {
                 self.bar.set_position(report.step);
-                let StepReport { loss, gaussians, .. } = report;
-                self.bar.set_message(format!("loss {loss:.4}  {gaussians} Gaussians"));
+                self.bar.set_message(self.state(report));
             }
             Event::Evaluated { step, evaluation } => {
                 if let Some(line) = summary(evaluation).filter(|_| step < self.steps) {
@@ -136,7 +144,9 @@ impl Reporter {
     fn write(&mut self, event: Event<'_>) {
         match event {
             Event::Started { memory, .. } => tell_on_stderr(foreseen(memory)),
-            Event::Step(report) if self.is_due() => tell_on_stderr(self.line(report)),
+            Event::Step(report) if self.is_due() => {
+                tell_on_stderr(format_args!("{}{}", self.prefix, self.line(report)));
+            }
             Event::HeldOut { step, psnr } => {
                 tell_on_stderr(format!(
                     "step {step}: held-out views {psnr:.2} dB against their targets"
@@ -211,6 +221,17 @@ impl Reporter {
         is_due
     }
 
+    /// What the bar says of a step.
+    fn state(&self, StepReport { step, loss, gaussians, .. }: &StepReport) -> String {
+        let held_out = self.held_out.map(|psnr| format!("  held-out {psnr:.2} dB"));
+        let rate = 1e3 / self.batching(*step).0;
+        let rate = if rate < 10.0 { format!("{rate:.1}") } else { format!("{rate:.0}") };
+        format!(
+            "loss {loss:.4}{}  {gaussians} Gaussians  {rate} steps/s",
+            held_out.unwrap_or_default()
+        )
+    }
+
     fn line(&self, StepReport { step, loss, gaussians, .. }: &StepReport) -> String {
         let (each, left) = self.batching(*step);
         let (steps, left) = (self.steps, duration(left));
@@ -261,19 +282,10 @@ fn means(evaluation: &Evaluation) -> Value {
     })
 }
 
-/// A duration in one or two units.
-fn duration(seconds: f64) -> String {
-    match seconds.round() as u64 {
-        seconds @ 0..60 => format!("{seconds} s"),
-        seconds @ 60..3600 => format!("{} min {} s", seconds / 60, seconds % 60),
-        seconds => format!("{} h {} min", seconds / 3600, seconds % 3600 / 60),
-    }
-}
-
-/// The bar: step, loss, Gaussians, steps per second and time left.
+/// The bar: step, loss, score of the held-out views, Gaussians, steps per second and time left.
 fn style(may_end_early: bool) -> ProgressStyle {
     let most = at_most(may_end_early);
-    let template = format!("{{bar:32}} {{pos}}/{{len}}  {{msg}}  {{per_sec}}  {most}{{eta}} left");
+    let template = format!("{{prefix}}{{bar:24}} {{pos}}/{{len}}  {{msg}}  {most}{{eta}} left");
     ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
@@ -288,7 +300,7 @@ mod tests {
 
     #[test]
     fn a_line_says_how_far_a_run_is_and_how_long_it_will_take() {
-        let mut progress = Reporter::new(ProgressForm::Plain);
+        let mut progress = Reporter::new(ProgressForm::Plain, "");
         (progress.steps, progress.begin) = (400, (Instant::now() - Duration::from_secs(50), 100));
         let report = StepReport {
             step: 200,
@@ -304,14 +316,14 @@ mod tests {
         progress.may_end_early = true;
         let expected = "step 200 of at most 400: loss 0.0432, 2400 Gaussians, 500 ms a step, at most 1 min 40 s left";
         assert_eq!(progress.line(&report), expected);
+        assert_eq!(progress.state(&report), "loss 0.0432  2400 Gaussians  2.0 steps/s");
+        progress.observe(Event::HeldOut { step: 180, psnr: 31.456 });
+        (progress.begin.0, progress.form) =
+            (Instant::now() - Duration::from_secs(1), ProgressForm::Bar);
+        let expected = "loss 0.0432  held-out 31.46 dB  2400 Gaussians  100 steps/s";
+        assert_eq!(progress.state(&report), expected);
         assert!(!progress.is_due());
         progress.last_line -= SILENCE;
         assert!(progress.is_due() && !progress.is_due());
-    }
-
-    #[test]
-    fn a_duration_has_two_units_at_most() {
-        let expected = [0.4, 59.4, 60.0, 156.0, 3600.0, 9000.0].map(duration);
-        assert_eq!(expected, ["0 s", "59 s", "1 min 0 s", "2 min 36 s", "1 h 0 min", "2 h 30 min"]);
     }
 }

@@ -1,5 +1,5 @@
 //! Signals to a run: SIGINT, SIGTERM and SIGHUP save and stop, another a second later or more ends the process at once,
-//! SIGUSR1 saves and continues.
+//! SIGUSR1 saves and continues, SIGUSR2 lets the run cool down and finish.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -27,8 +27,12 @@ pub(super) fn requests() -> Result<Requests> {
         flag::register_usize(signal, stop, Requests::code(cause)).map_err(refused)?;
     }
     #[cfg(unix)]
-    flag::register(signal_hook::consts::SIGUSR1, Arc::clone(requests.save_flag()))
-        .map_err(refused)?;
+    for (signal, wanted) in [
+        (signal_hook::consts::SIGUSR1, requests.save_flag()),
+        (signal_hook::consts::SIGUSR2, requests.finish_flag()),
+    ] {
+        flag::register(signal, Arc::clone(wanted)).map_err(refused)?;
+    }
     Ok(requests)
 }
 

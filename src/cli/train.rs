@@ -7,19 +7,19 @@ use std::sync::Arc;
 
 use anyhow::Result;
 use nightsplat_core::camera::frame;
-use nightsplat_core::output::{one_line, printable};
+use nightsplat_core::output::{check_apart, one_line, printable};
 use nightsplat_photographs::tree::check_writable;
 
 pub(crate) use self::options::TrainOptions;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
-use super::{finish, phases, print, signals, tell, view, word};
+use super::{finish, phases, print, signals, stopped, tell, view, word};
 use crate::Error;
 use crate::driver;
 use crate::gpu::DeviceChoice;
 use crate::live;
 use crate::results::eval;
-use crate::results::run::{self, Event, IfExists, RunDirectory, RunSummary, Session};
+use crate::results::run::{self, Event, IfExists, Requests, RunDirectory, RunSummary, Session};
 use crate::results::run_facts::RunFacts;
 use crate::train::diagnose::Plan;
 use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
@@ -32,8 +32,9 @@ use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 /// benchmarks), nothing is chosen.
 ///
 /// SIGINT, SIGTERM and SIGHUP save a checkpoint and stop, with exit code 130, 143 or 129; another a second later or
-/// more ends the process at once. Under nohup, SIGHUP does nothing. SIGUSR1 saves a checkpoint and continues. --resume
-/// continues a run to the same bits; on a finished run it does nothing.
+/// more ends the process at once. Under nohup, SIGHUP does nothing. SIGUSR1 saves a checkpoint and continues, SIGUSR2
+/// lets the run cool down from there, and scores and writes it. --resume continues a run to the same bits; on a
+/// finished run it does nothing.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLE)]
 pub struct TrainArgs {
@@ -52,6 +53,9 @@ pub struct TrainArgs {
     /// change.
     #[arg(long, conflicts_with = "overwrite")]
     pub resume: bool,
+    /// With --resume: good enough; cool down from the checkpoint, score and write, instead of training to the last step
+    #[arg(long, requires = "resume")]
+    pub finish: bool,
     /// Plan that `nightsplat diagnose --plan` wrote; none: defaults [default: diagnose the photographs]
     #[arg(long, value_name = "FILE|none")]
     pub plan: Option<PathBuf>,
@@ -70,6 +74,9 @@ pub struct TrainArgs {
     pub explain: bool,
     #[command(flatten)]
     pub(crate) options: TrainOptions,
+    /// Begins every line of progress, where training is one of several stages.
+    #[arg(skip)]
+    pub prefix: String,
 }
 
 const EXAMPLE: &str = "Example:
@@ -77,14 +84,30 @@ const EXAMPLE: &str = "Example:
 
 /// Trains, scores and writes the run directory.
 pub fn run(args: &TrainArgs) -> Result<()> {
+    if let Some(wrote) = train(args, None)? {
+        finish(&wrote, &next(args));
+    }
+    Ok(())
+}
+
+/// Trains, scores and writes the run directory; the requests are by default those of signals. Returns what was written,
+/// unless only JSON or an explanation is wanted.
+pub(super) fn train(args: &TrainArgs, requests: Option<&Requests>) -> Result<Option<String>> {
     let mut requested = args.options.requested(&args.dataset)?;
     requested.settings(None)?.config()?.check()?;
     check_writable(&args.out)?;
+    let is_resumed = args.resume && args.out.join("config.toml").is_file();
+    if !is_resumed {
+        check_apart(&args.out, &args.dataset, true)?;
+    }
     match args.resume {
         true => RunDirectory::check_resumed(&args.out)?,
         false => RunDirectory::check(&args.out, args.overwrite)?,
     }
-    let is_resumed = args.resume && args.out.join("config.toml").is_file();
+    if args.finish && !run::has_checkpoint(&args.out) {
+        let problem = "has no checkpoint to finish from; train it first";
+        return Err(Error::input(&args.out, problem).into());
+    }
     if is_resumed && args.options.gives("steps") {
         // The held-out views of the run stay held out.
         let views = i64::try_from(run::load_config(&args.out)?.stop.views)?;
@@ -96,8 +119,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         && !args.explain
         && let Some(steps) = done_by_stamp(args, &requested, file.as_deref())?
     {
-        tell_done(args, steps);
-        return Ok(());
+        return Ok(Some(done(args, steps)));
     }
     let device = requested.settings(None)?.config()?.device;
     let choice = device.parse::<DeviceChoice>()?;
@@ -105,15 +127,15 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let planning = planning(args, file.as_deref(), is_resumed);
     let PlannedRun { config, settings, plan, dataset } = requested.planned(planning, &gpu)?;
     if args.explain {
-        return Ok(print(printable(&settings.explained(&config)?))?);
+        print(printable(&settings.explained(&config)?))?;
+        return Ok(None);
     }
     for line in args.options.idle(&config) {
         tracing::warn!("{line}");
     }
     let finished = if args.resume { run::done_steps(&args.out, &config, &dataset)? } else { None };
     if let Some(steps) = finished {
-        tell_done(args, steps);
-        return Ok(());
+        return Ok(Some(done(args, steps)));
     }
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
     let (is_text, is_quiet) = (form != ProgressForm::Json, form == ProgressForm::None);
@@ -124,8 +146,11 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let if_exists =
         if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
-    let mut progress = Reporter::new(form).with_facts(serde_json::json!(facts));
-    let requests = signals::requests()?;
+    let mut progress = Reporter::new(form, &args.prefix).with_facts(serde_json::json!(facts));
+    let requests = requests.map_or_else(signals::requests, |requests| Ok(requests.clone()))?;
+    if args.finish {
+        requests.finish();
+    }
     let dataset = Arc::new(dataset);
     let page = args
         .view
@@ -151,7 +176,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let RunSummary { trainer, ended, evaluation, spent, .. } = done;
     phases::log();
     if !is_text {
-        return Ok(());
+        return Ok(None);
     }
     let gaussians = trainer.gaussian_count();
     tell(ended);
@@ -171,8 +196,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         tell(format_args!("model.ply: {line}"));
     }
     let run = args.out.display();
-    finish(&format!("{run}/model.ply, {run}/metrics.json"), &next(args));
-    Ok(())
+    Ok(Some(format!("{run}/model.ply, {run}/metrics.json")))
 }
 
 /// How the run ended, as its page says it.
@@ -180,10 +204,7 @@ fn ended_on_page<T>(args: &TrainArgs, done: &crate::Result<T>) -> String {
     let run = word(&args.out);
     match done {
         Ok(_) => format!("finished, saved; next: nightsplat export {run} --format html"),
-        Err(Error::Stopped { step, .. }) => format!(
-            "stopped at step {step}, saved; go on with the same command and --resume, or export it: nightsplat export \
-             {run} --format html"
-        ),
+        Err(Error::Stopped { step, cause, .. }) => stopped::stopped(*step, *cause),
         Err(error) => format!("ended: {error}"),
     }
 }
@@ -194,10 +215,11 @@ fn next(args: &TrainArgs) -> String {
     format!("nightsplat export {run} --format html  (then open {run}/model.html)")
 }
 
-fn tell_done(args: &TrainArgs, steps: u64) {
+/// Tells that nothing is left to do, and that nothing was written.
+fn done(args: &TrainArgs, steps: u64) -> String {
     let done = format!("{} is done: {steps} steps", args.out.display());
     tell(one_line(&done));
-    finish("", &next(args));
+    String::new()
 }
 
 /// The step count of the run to resume if it is finished and the files of its dataset are unchanged. Decodes nothing.

@@ -54,6 +54,8 @@ struct FeedState {
     model: Bytes,
     /// Steps of the model, if it is of the training in this process.
     step: Option<u64>,
+    /// The last step of that training, once it is certain.
+    last: Option<u64>,
     /// Time and length of the file that it was read from.
     file: Option<Stamp>,
     /// The checksum by which edit lists name a model file; `None` of a model that is no file, or not sent whole.
@@ -113,9 +115,13 @@ impl Feed {
 
     /// Takes what the training in this process reports.
     pub(crate) fn observe(&self, event: Event<'_>) {
-        let Event::Snapshot { step, model, seconds } = event else { return };
         let begin = Instant::now();
         let mut state = self.lock();
+        let (step, model, seconds) = match event {
+            Event::Snapshot { step, model, seconds } => (step, model, seconds),
+            Event::LastStep { last, .. } => return state.last = Some(last),
+            _ => return,
+        };
         state.show(&model.shown(), Some(step));
         let spent = seconds + begin.elapsed().as_secs_f64();
         let rest = Duration::from_secs_f64(spent / SNAPSHOT_SHARE).max(SNAPSHOT_EVERY);
@@ -129,6 +135,7 @@ impl Feed {
             "pause" => requests.pause(true),
             "resume" => requests.pause(false),
             "save" => requests.save(),
+            "finish" => requests.finish(),
             "stop" => requests.stop(Stop::Interrupted),
             _ => return false,
         }
@@ -168,6 +175,9 @@ impl Feed {
         if paused {
             told["phase"] = "paused".into();
         }
+        if state.last.is_some() {
+            told["steps"] = state.last.into();
+        }
         told["model"] = state.version.into();
         told["modelStep"] = state.step.into();
         told["fingerprint"] = state.fingerprint.clone().into();
@@ -192,6 +202,7 @@ impl FeedState {
             version: 0,
             model: Bytes::new(),
             step: None,
+            last: None,
             file: None,
             fingerprint: None,
             problem: None,
@@ -340,6 +351,8 @@ mod tests {
         assert!(feed.follow("pause") && requests.is_paused());
         assert_eq!(feed.state()["phase"], "paused");
         assert!(feed.follow("resume") && !requests.is_paused());
+        feed.observe(Event::LastStep { step: 7, last: 12 });
+        assert!(feed.follow("finish") && feed.state()["steps"] == 12);
         assert!(feed.follow("stop") && requests.stops() == Some(Stop::Interrupted));
         assert!(!feed.follow("format"));
     }

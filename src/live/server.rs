@@ -1,7 +1,7 @@
 //! An HTTP server for one page. A random token in its address is the key to everything; who lacks it learns nothing.
 
 use std::convert::Infallible;
-use std::net::{SocketAddr, TcpListener};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener, UdpSocket};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -105,9 +105,13 @@ impl Server {
         Ok(Self { address, token, stop: Some(stop), thread: Some(thread) })
     }
 
-    /// The address of the page.
+    /// The address of the page: that of this machine, if it listens on all.
     pub(crate) fn url(&self) -> String {
-        format!("http://{}/{}/", self.address, self.token)
+        let mut address = self.address;
+        if address.ip().is_unspecified() {
+            address.set_ip(own_address(address.is_ipv6()));
+        }
+        format!("http://{address}/{}/", self.token)
     }
 }
 
@@ -117,6 +121,21 @@ impl Drop for Server {
         let _ = self.stop.take().map(|stop| stop.send(()));
         let _ = self.thread.take().map(JoinHandle::join);
     }
+}
+
+/// The address under which others reach this machine, or only itself without a network. Nothing is sent.
+fn own_address(is_v6: bool) -> IpAddr {
+    let (any, far) = match is_v6 {
+        true => ("[::]:0", "[2001:db8::1]:9"),
+        false => ("0.0.0.0:0", "192.0.2.1:9"),
+    };
+    let towards_far = || {
+        let socket = UdpSocket::bind(any)?;
+        socket.connect(far)?;
+        Ok::<_, std::io::Error>(socket.local_addr()?.ip())
+    };
+    let loopback = if is_v6 { Ipv6Addr::LOCALHOST.into() } else { Ipv4Addr::LOCALHOST.into() };
+    towards_far().ok().filter(|ip| !ip.is_unspecified()).unwrap_or(loopback)
 }
 
 /// 128 random bits.

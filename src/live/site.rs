@@ -52,7 +52,7 @@ impl Site {
     /// | `state` | the progress, as JSON |
     /// | `model` | the model, as the viewer reads it |
     /// | `picture/VIEW/KIND` | a photograph, target or reference image, as JPEG |
-    /// | `do/WHAT` (POST) | pause, resume, save or stop |
+    /// | `do/WHAT` (POST) | pause, resume, save, finish or stop |
     pub(super) fn answer(&self, method: &Method, path: &str) -> Answer {
         let parts: Vec<&str> = path.split('/').collect();
         match (method.as_str(), &parts[..]) {

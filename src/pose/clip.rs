@@ -29,7 +29,7 @@ pub(super) fn frames(
     let pattern = pattern(folder);
     let options = ["-hide_banner", "-nostdin", "-i"].map(OsStr::new);
     let files = [clip.as_os_str(), "-vf".as_ref(), filter.as_ref(), pattern.as_os_str()];
-    ffmpeg.run("", &[&options[..], &files].concat(), |_| {})?;
+    ffmpeg.run("", &[&options[..], &files].concat(), None, |_| {})?;
     let frames = photographs_in(folder)?;
     if frames.is_empty() {
         return Err(Error::input(clip, "contains no frame that ffmpeg can decode"));

@@ -18,6 +18,14 @@ pub(super) struct PosePhotographs {
 }
 
 impl PosePhotographs {
+    /// Leaves out those without a copy, which do not decode.
+    pub(super) fn retain_copied(&mut self) {
+        let copied = |paths: &[PathBuf]| -> Vec<PathBuf> {
+            paths.iter().filter(|path| self.copy(path).is_file()).cloned().collect()
+        };
+        (self.dark, self.bright) = (copied(&self.dark), copied(&self.bright));
+    }
+
     /// All photographs, the dark ones first.
     pub(super) fn all(&self) -> Vec<PathBuf> {
         [self.dark.as_slice(), self.bright.as_slice()].concat()

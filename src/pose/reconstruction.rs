@@ -2,13 +2,15 @@
 
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
-use nightsplat_core::output::create_folder;
+use nightsplat_core::output::{create_folder, duration};
 use nightsplat_photographs::dataset::Dataset;
 
 use super::pictures::{PosePhotographs, is_dark};
 use super::stages::StageProgress;
 use super::tool::Tool;
+use super::unfinished::Unfinished;
 use super::{PoseOptions, PoseProgress, cameras};
 use crate::{Error, Result};
 
@@ -54,7 +56,9 @@ pub(super) struct Reconstruction<'a> {
     relaxed: &'static [(&'static str, &'static str)],
     /// The user's options: command, name and value.
     user_options: Vec<(&'static str, String, String)>,
-    work: &'a Path,
+    out: &'a Unfinished,
+    /// The end of the time for further attempts.
+    until: Option<Instant>,
     database: PathBuf,
     models: PathBuf,
 }
@@ -76,6 +80,9 @@ const RELAXED: [&[(&str, &str)]; 2] = [
     ],
 ];
 
+/// The least time of a first attempt that those after it are measured by, seconds.
+const LEAST_FIRST: f64 = 15.0;
+
 /// Options with their values.
 type Options = Vec<(String, OsString)>;
 
@@ -85,14 +92,13 @@ impl<'a> Reconstruction<'a> {
         settings: &'a PoseOptions,
         colmap: Tool<'a>,
         matcher: Matcher,
-        work: &'a Path,
+        out: &'a Unfinished,
     ) -> Result<Self> {
         let is_global = settings.mapper == Mapper::Global;
         let needs_glomap = is_global && !colmap.help_contains(&["help"], GLOBAL);
-        let glomap = || colmap.with_same_log(&settings.glomap, "glomap").found("");
+        let glomap = || colmap.beside(&settings.glomap, "glomap").found();
         let glomap = needs_glomap.then(glomap).transpose()?;
-        let (database, models) = (work.join("database.db"), work.join("sparse"));
-        create_folder(&models)?;
+        let (database, models) = (out.work.join("database.db"), out.work.join("sparse"));
         let mapper = if is_global && !needs_glomap { GLOBAL } else { "mapper" };
         let commands = ["feature_extractor", matcher.command(), mapper];
         let mut user_options = vec![];
@@ -123,7 +129,8 @@ impl<'a> Reconstruction<'a> {
             is_guided: false,
             relaxed: &[],
             user_options,
-            work,
+            out,
+            until: None,
             database,
             models,
         })
@@ -132,7 +139,8 @@ impl<'a> Reconstruction<'a> {
     /// The folder of the models, each a folder; it is empty if nothing could be reconstructed. If more than a tenth of
     /// the dark photographs have no camera, all are matched again, guided: without it, the result of a small set
     /// depends on chance; always matching guided would double the time of a large one. If most still have none, the
-    /// choice of the initial pair is relaxed.
+    /// choice of the initial pair is relaxed. All of this together takes [`PoseOptions::patience`] times the time of
+    /// the first attempt at most. Stages that an earlier call has done are not repeated.
     pub(super) fn models(
         mut self,
         pictures: &PosePhotographs,
@@ -140,27 +148,34 @@ impl<'a> Reconstruction<'a> {
     ) -> Result<PathBuf> {
         let copies = pictures.copies.as_path();
         self.photographs = pictures.dark.len() + pictures.bright.len();
-        self.extract(pictures, report)?;
-        // COLMAP matches no pair twice: matching again begins with the features alone.
-        let features = self.work.join("guided.db");
-        if self.database.is_file() {
-            std::fs::copy(&self.database, &features)
-                .map_err(|error| Error::output(&features, format!("cannot be written: {error}")))?;
-        }
-        self.match_features(report)?;
-        self.register(copies, report)?;
+        let features = self.out.work.join("guided.db");
+        self.once("features", || self.extract(pictures, &features, report))?;
+        self.once("matching", || self.match_features(report))?;
+        self.once("registering", || self.register(copies, report))?;
         let all = pictures.dark.len();
         let mut placed = placed_in(&self.models)?;
         let mut best = self.models.clone();
         if 10 * placed >= 9 * all {
             return Ok(best);
         }
-        let line = format!("{placed} of {all} have a camera: matching again, guided");
+        let first = ["matching", "registering"].map(|stage| self.out.seconds_of(stage));
+        let first: f64 = first.into_iter().flatten().sum();
+        if self.options.patience == 0.0 {
+            return Ok(best);
+        }
+        let patience = Duration::from_secs_f64(self.options.patience * first.max(LEAST_FIRST));
+        self.until = Some(Instant::now() + patience);
+        let line = format!(
+            "{placed} of {all} have a camera: matching again, guided, for at most {}",
+            duration(patience.as_secs_f64())
+        );
         report(PoseProgress::Line(&line));
         self.is_guided = true;
-        self.use_folder("guided")?;
+        self.models = self.out.work.join("guided");
         self.database = features;
-        match self.match_features(report).and_then(|()| self.register(copies, report)) {
+        let again = self.once("guided-matching", || self.match_features(report));
+        match again.and_then(|()| self.once("guided", || self.register(copies, report))) {
+            Err(error) if error.is_stop() => return Err(error),
             // The models of the first attempt are still there.
             Err(error) if placed > 0 => {
                 tracing::warn!("{error}; using the cameras of the first attempt");
@@ -170,7 +185,7 @@ impl<'a> Reconstruction<'a> {
         }
         for (step, relaxed) in [&[][..]].into_iter().chain(RELAXED).enumerate() {
             if !relaxed.is_empty() {
-                if 2 * placed >= all || self.options.mapper == Mapper::Global {
+                if 2 * placed >= all || self.options.mapper == Mapper::Global || self.is_late() {
                     break;
                 }
                 let line = format!(
@@ -178,25 +193,54 @@ impl<'a> Reconstruction<'a> {
                 );
                 report(PoseProgress::Line(&line));
                 self.relaxed = relaxed;
-                self.use_folder(&format!("relaxed{step}"))?;
-                self.register(copies, report)?;
+                let name = format!("relaxed{step}");
+                self.models = self.out.work.join(&name);
+                self.once(&name, || self.register(copies, report))?;
             }
             let found = placed_in(&self.models)?;
             if found > placed {
                 (placed, best) = (found, self.models.clone());
             }
         }
+        if self.is_late() {
+            report(PoseProgress::Line(&format!(
+                "{placed} of {all} have a camera, and the time for further attempts is up (--patience {} allows more)",
+                2.0 * self.options.patience
+            )));
+        }
         Ok(best)
     }
 
-    /// Writes models into another folder from now on.
-    fn use_folder(&mut self, name: &str) -> Result<()> {
-        self.models = self.work.join(name);
-        create_folder(&self.models)
+    /// Does a stage that no earlier call has done. One that ran out of time is not done.
+    fn once(&self, stage: &str, work: impl FnOnce() -> Result<()>) -> Result<()> {
+        if self.out.seconds_of(stage).is_some() {
+            return Ok(());
+        }
+        let begin = Instant::now();
+        work()?;
+        if self.is_late() { Ok(()) } else { self.out.done(stage, begin.elapsed().as_secs_f64()) }
     }
 
-    /// Extracts the features of each photograph. Those of one group share a camera.
-    fn extract(&self, pictures: &PosePhotographs, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
+    /// Whether the time for further attempts is up.
+    fn is_late(&self) -> bool {
+        self.until.is_some_and(|until| until <= Instant::now())
+    }
+
+    /// Extracts the features of each photograph into the database, and copies that to `features`: COLMAP matches no
+    /// pair twice, so matching again begins with the features alone. Those of one group share a camera, for which an
+    /// interrupted call has to begin anew.
+    fn extract(
+        &self,
+        pictures: &PosePhotographs,
+        features: &Path,
+        report: &dyn Fn(PoseProgress<'_>),
+    ) -> Result<()> {
+        for ending in ["", "-shm", "-wal"] {
+            let mut file = self.database.as_os_str().to_owned();
+            file.push(ending);
+            // Most often there is none.
+            let _ = std::fs::remove_file(file);
+        }
         let command = "feature_extractor";
         let photographs = pictures.all();
         let groups = cameras::groups(&photographs);
@@ -220,13 +264,17 @@ impl<'a> Reconstruction<'a> {
                 options.push(("ImageReader.mask_path".to_owned(), pictures.masks.clone().into()));
             }
             if runs.len() > 1 {
-                let list = self.work.join(format!("camera{at}.txt"));
+                let list = self.out.work.join(format!("camera{at}.txt"));
                 let names = group.iter().map(|path| pictures.name(path)).collect::<Vec<_>>();
                 std::fs::write(&list, names.join("\n") + "\n")
                     .map_err(|error| Error::output(&list, format!("cannot be written: {error}")))?;
                 options.push(("image_list_path".to_owned(), list.into()));
             }
             self.run(&self.colmap, command, options, "features", report)?;
+        }
+        if self.database.is_file() {
+            std::fs::copy(&self.database, features)
+                .map_err(|error| Error::output(features, format!("cannot be written: {error}")))?;
         }
         report(PoseProgress::Line(&match runs.len() {
             1 => "features extracted".to_owned(),
@@ -252,11 +300,14 @@ impl<'a> Reconstruction<'a> {
             options.push(("ExhaustiveMatching.block_size".to_owned(), block.to_string().into()));
         }
         self.run(&self.colmap, command, options, "matching", report)?;
-        report(PoseProgress::Line("features matched"));
+        self.tell("features matched", report);
         Ok(())
     }
 
     fn register(&self, tone_mapped: &Path, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
+        // Of an earlier call that was stopped.
+        let _ = std::fs::remove_dir_all(&self.models);
+        create_folder(&self.models)?;
         let mut files = self.files(tone_mapped);
         files.push(("output_path".to_owned(), self.models.clone().into()));
         let run = |tool, command, files| self.run(tool, command, files, "registering", report);
@@ -279,8 +330,15 @@ impl<'a> Reconstruction<'a> {
             Err(_) if NO_INITIAL_PAIR.iter().any(|words| self.colmap.printed(words)) => {}
             outcome => outcome?,
         }
-        report(PoseProgress::Line("cameras placed"));
+        self.tell("cameras placed", report);
         Ok(())
+    }
+
+    /// Tells the end of a stage, unless its time was up.
+    fn tell(&self, line: &str, report: &dyn Fn(PoseProgress<'_>)) {
+        if !self.is_late() {
+            report(PoseProgress::Line(line));
+        }
     }
 
     /// Runs a command and reports its progress. The user's options override `options`.
@@ -300,11 +358,13 @@ impl<'a> Reconstruction<'a> {
             options.into_iter().map(|(name, value)| [format!("--{name}").into(), value]).collect();
         let arguments: Vec<&OsStr> = options.iter().flatten().map(OsString::as_os_str).collect();
         let mut stage = StageProgress::new(what, self.photographs);
-        tool.run(command, &arguments, |printed| {
+        let watch = |printed: &str| {
             if let Some(line) = stage.due(printed) {
                 report(PoseProgress::Line(&line));
             }
-        })
+        };
+        // What is late looks at the time itself.
+        tool.run(command, &arguments, self.until, watch).map(drop)
     }
 
     fn files(&self, tone_mapped: &Path) -> Options {

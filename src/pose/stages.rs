@@ -2,6 +2,8 @@
 
 use std::time::{Duration, Instant};
 
+use nightsplat_core::output::about;
+
 /// Time between two lines about one command.
 const INTERVAL: Duration = Duration::from_secs(10);
 
@@ -9,13 +11,15 @@ const INTERVAL: Duration = Duration::from_secs(10);
 pub(super) struct StageProgress<'a> {
     what: &'a str,
     photographs: usize,
+    begin: Instant,
     last: Instant,
 }
 
 impl<'a> StageProgress<'a> {
     /// Starts a stage on this number of photographs; `what` begins its lines.
     pub(super) fn new(what: &'a str, photographs: usize) -> Self {
-        Self { what, photographs, last: Instant::now() }
+        let now = Instant::now();
+        Self { what, photographs, begin: now, last: now }
     }
 
     /// The next line if it is due, from the output so far.
@@ -25,15 +29,19 @@ impl<'a> StageProgress<'a> {
         }
         self.last = Instant::now();
         let how_far = match counted(printed, self.photographs) {
-            Some([at, of]) => format!("{at} of {of}"),
+            Some([at, of]) => {
+                let left = self.begin.elapsed().as_secs_f64() * (of - at) as f64 / at.max(1) as f64;
+                let left = if at > 0 { format!(", {} left", about(left)) } else { String::new() };
+                format!("{at} of {of}{left}")
+            }
             None => "at work".to_owned(),
         };
         Some(format!("{}: {how_far}", self.what))
     }
 }
 
-/// The last count that COLMAP printed, and the total: files as [3/48], blocks of pairs as [1/6, 2/6], and photographs
-/// that the current model has, as "Registering image #9 (4)".
+/// The last count that COLMAP printed, and the total, which no count exceeds: files as [3/48], blocks of pairs as
+/// [1/6, 2/6], and photographs that the current model has.
 fn counted(printed: &str, photographs: usize) -> Option<[usize; 2]> {
     let bracket = |line: &str| {
         let inside = line.split_once('[')?.1.split_once(']')?.0;
@@ -50,16 +58,29 @@ fn counted(printed: &str, photographs: usize) -> Option<[usize; 2]> {
             _ => None,
         }
     };
-    let registered = |line: &str| {
-        let inside =
-            line.split_once("Registering image #")?.1.split_once('(')?.1.split_once(')')?.0;
-        // COLMAP from 3.12 on names the number.
-        let count: usize =
-            inside.trim_start_matches(|letter: char| !letter.is_ascii_digit()).parse().ok()?;
-        Some([count.min(photographs), photographs])
-    };
-    let lines = || printed.lines().rev();
-    lines().find_map(registered).or_else(|| lines().find_map(bracket))
+    let in_model = registered(printed).map(|count| [count, photographs]);
+    let found = in_model.or_else(|| printed.lines().rev().find_map(bracket));
+    found.map(|[at, of]| [at.min(of), of])
+}
+
+/// The photographs that the current model has, by lines such as "Registering image #9 (4)", which tries a fourth.
+fn registered(printed: &str) -> Option<usize> {
+    let mut count = None;
+    for line in printed.lines() {
+        if line.contains("Initializing with image pair") {
+            count = Some(2);
+        } else if let Some((_, attempt)) = line.split_once("Registering image #") {
+            let inside = attempt.split_once('(').and_then(|(_, rest)| rest.split_once(')'));
+            // COLMAP from 3.12 on names the number.
+            let number = inside.map(|(inside, _)| {
+                inside.trim_start_matches(|letter: char| !letter.is_ascii_digit())
+            });
+            count = number.and_then(|number| number.parse().ok()).or(count);
+        } else if line.contains("Could not register") {
+            count = count.map(|count: usize| count.saturating_sub(1));
+        }
+    }
+    count
 }
 
 #[cfg(test)]
@@ -79,6 +100,13 @@ mod tests {
             ("I2026] Registering image #4 (num_reg_frames=3)", Some([3, 24])),
             ("Registering image #9 (24)\nRegistering image #3 (25)\n => failed", Some([24, 24])),
             ("Registering image #9 (24)\nInitializing\nRegistering image #1 (3)", Some([3, 24])),
+            ("Registering image #9 (24)\nInitializing with image pair #1 and #5", Some([2, 24])),
+            (
+                "Registering image #9 (4)\n  => Could not register, trying another image.\n\
+                 Registering image #2 (4)\n  => Could not register, trying another image.",
+                Some([3, 24]),
+            ),
+            ("Processed file [50/48]", Some([48, 48])),
             ("[no/count]\nnothing [", None),
         ];
         for (printed, expected) in cases {
@@ -87,7 +115,9 @@ mod tests {
         let mut stage = StageProgress::new("matching", 24);
         assert_eq!(stage.due("Matching block [1/1, 1/1]"), None, "too early");
         stage.last = Instant::now().checked_sub(INTERVAL).unwrap();
-        assert_eq!(stage.due("Matching block [1/2, 1/2]").unwrap(), "matching: 1 of 4");
+        stage.begin = Instant::now().checked_sub(Duration::from_secs(40)).unwrap();
+        let line = "matching: 1 of 4, about 2 min left";
+        assert_eq!(stage.due("Matching block [1/2, 1/2]").unwrap(), line);
         stage.last = Instant::now().checked_sub(INTERVAL).unwrap();
         assert_eq!(stage.due("").unwrap(), "matching: at work");
     }

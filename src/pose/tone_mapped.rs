@@ -21,13 +21,13 @@ use crate::targets::Targets;
 /// do not decode are removed from `photographs`, with a warning.
 ///
 /// # Errors
-/// None decodes, all are black, or the device is out of memory.
+/// None decodes, all are black, or the device is out of memory; or `report` fails.
 pub(super) fn write(
     gpu: &Gpu,
     photographs: &mut Vec<PathBuf>,
     light: Option<StoredLight>,
     folder: &Path,
-    report: &dyn Fn(PoseProgress<'_>),
+    report: &dyn Fn(PoseProgress<'_>) -> Result<()>,
 ) -> Result<f64> {
     create_folder(folder)?;
     // The same curve for all, so that features keep matching.
@@ -38,10 +38,15 @@ pub(super) fn write(
     let levels = Levels::of_all(light, &paths);
     levels.say();
     let colours = ColourCounts::of_levels(levels);
-    let (mut measured, mut undecoded) = (vec![], None);
+    let (mut measured, mut undecoded, mut stopped) = (vec![], None, Ok(()));
     photographs.retain(|path| {
         done += 1;
-        report(PoseProgress::Photographs { done, all });
+        if stopped.is_ok() {
+            stopped = report(PoseProgress::Photographs { done, all });
+        }
+        if stopped.is_err() {
+            return true;
+        }
         match Image::load_counted(path, &colours) {
             Ok(image) => measured.push(MeasuredPhotograph::measure(&image.data)),
             Err(error) => {
@@ -52,6 +57,7 @@ pub(super) fn write(
         }
         true
     });
+    stopped?;
     if let (true, Some(error)) = (photographs.is_empty(), undecoded) {
         return Err(error);
     }
@@ -67,7 +73,7 @@ pub(super) fn write(
         } else {
             image.save_png8(file)?;
         }
-        report(PoseProgress::Photographs { done: at + 1, all: photographs.len() });
+        report(PoseProgress::Photographs { done: at + 1, all: photographs.len() })?;
     }
     Ok(targets.scene.exposure.map_or(1.0, |exposure| exposure.gain))
 }

@@ -1,36 +1,46 @@
-//! Runs external programs and logs their output.
+//! Runs external programs, logs their output, and stops them.
 
 use std::ffi::OsStr;
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
 use std::path::Path;
-use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
 
-use crate::{Error, Result};
+use super::unfinished::Unfinished;
+use crate::{Error, Result, Stop};
 
-/// An external program whose output goes to a log.
+/// An external program that works in an unfinished dataset. It holds the lock of that as long as it runs, so that none
+/// that outlives this process writes into what another process uses.
+#[derive(Clone, Copy)]
 pub(super) struct Tool<'a> {
     path: &'a Path,
     name: &'static str,
-    log: &'a Path,
+    out: &'a Unfinished,
+    /// The request to stop, if there is one.
+    stops: &'a dyn Fn() -> Option<Stop>,
 }
 
 /// Lines of a failed program's output that its error quotes.
 const QUOTED_LINES: usize = 3;
 
 impl<'a> Tool<'a> {
-    pub(super) fn new(path: &'a Path, name: &'static str, log: &'a Path) -> Self {
-        Self { path, name, log }
+    pub(super) fn new(
+        path: &'a Path,
+        name: &'static str,
+        out: &'a Unfinished,
+        stops: &'a dyn Fn() -> Option<Stop>,
+    ) -> Self {
+        Self { path, name, out, stops }
     }
 
-    /// Another program with the same log.
-    pub(super) fn with_same_log(&self, path: &'a Path, name: &'static str) -> Self {
-        Self::new(path, name, self.log)
+    /// Another program for the same dataset.
+    pub(super) fn beside(&self, path: &'a Path, name: &'static str) -> Self {
+        Self { path, name, ..*self }
     }
 
     /// Checks that the program runs.
-    pub(super) fn found(self, alternative: &str) -> Result<Self> {
+    pub(super) fn found(self) -> Result<Self> {
         let started = Command::new(self.path).arg("-h").stdin(Stdio::null()).output();
         let Err(error) = started else { return Ok(self) };
         let (path, name) = (self.path.display(), self.name);
@@ -38,10 +48,8 @@ impl<'a> Tool<'a> {
             ErrorKind::NotFound => format!("`{path}` is not found"),
             _ => format!("`{path}` does not run ({error})"),
         };
-        let alternative =
-            if alternative.is_empty() { String::new() } else { format!("; {alternative}") };
         Err(Error::Usage(format!(
-            "{problem}; install it ({}) or name it with --{name} PATH{alternative}",
+            "{problem}; install it ({}) or name it with --{name} PATH",
             how_to_install(name)
         )))
     }
@@ -74,19 +82,24 @@ impl<'a> Tool<'a> {
         output.status.success().then(|| text.lines().next().unwrap_or_default().to_owned())
     }
 
-    /// Runs one of its commands to completion, and passes the output so far to `watch`, twice a second.
+    /// Runs one of its commands to completion, and passes the output so far to `watch`, twice a second. False: the time
+    /// was up before.
+    ///
+    /// # Errors
+    /// It fails, or is stopped on request.
     pub(super) fn run(
         &self,
         command: &str,
         arguments: &[&OsStr],
+        until: Option<Instant>,
         mut watch: impl FnMut(&str),
-    ) -> Result<()> {
+    ) -> Result<bool> {
+        let path = self.out.log.as_path();
         let cannot = |error: std::io::Error| {
             let problem = format!("cannot be written ({error}); check the folder and the disk");
-            Error::output(self.log, problem)
+            Error::output(path, problem)
         };
-        let mut log =
-            OpenOptions::new().create(true).append(true).open(self.log).map_err(cannot)?;
+        let mut log = OpenOptions::new().create(true).append(true).open(path).map_err(cannot)?;
         let shown: Vec<_> = arguments.iter().map(|argument| argument.to_string_lossy()).collect();
         let begin = log.metadata().map_err(cannot)?.len() as usize;
         writeln!(log, "$ {} {command} {}", self.path.display(), shown.join(" ")).map_err(cannot)?;
@@ -95,13 +108,17 @@ impl<'a> Tool<'a> {
         if !command.is_empty() {
             process.arg(command);
         }
-        // COLMAP without a display.
-        process.args(arguments).env("QT_QPA_PLATFORM", "offscreen").stdin(Stdio::null());
+        // COLMAP without a display. Signals of the terminal are for this process, which passes them on.
+        process.args(arguments).env("QT_QPA_PLATFORM", "offscreen");
+        #[cfg(unix)]
+        std::os::unix::process::CommandExt::process_group(&mut process, 0);
         let unrunnable = |error| Error::input(self.path, format!("does not run: {error}"));
+        process.stdin(self.out.lock.shared().map_err(cannot)?);
         let started = process.stdout(output(&log)?).stderr(output(&log)?).spawn();
         let mut child = started.map_err(unrunnable)?;
+        self.out.lock.name(child.id());
         let printed = || {
-            let printed = std::fs::read(self.log).unwrap_or_default();
+            let printed = std::fs::read(path).unwrap_or_default();
             String::from_utf8_lossy(printed.get(begin..).unwrap_or_default()).into_owned()
         };
         let mut pause = Duration::from_millis(5);
@@ -109,12 +126,21 @@ impl<'a> Tool<'a> {
             if let Some(status) = child.try_wait().map_err(unrunnable)? {
                 break status;
             }
+            if let Some(cause) = (self.stops)() {
+                end(&mut child).map_err(unrunnable)?;
+                let stage = if command.is_empty() { self.name } else { command };
+                return Err(self.out.stopped(stage, cause));
+            }
+            if until.is_some_and(|until| until <= Instant::now()) {
+                end(&mut child).map_err(unrunnable)?;
+                return Ok(false);
+            }
             std::thread::sleep(pause);
             pause = (2 * pause).min(Duration::from_millis(500));
             watch(&printed());
         };
         if status.success() {
-            return Ok(());
+            return Ok(true);
         }
         let printed = printed();
         let quoted = quoted(printed.lines().skip(1));
@@ -123,9 +149,15 @@ impl<'a> Tool<'a> {
 
     /// Whether the log contains `what`.
     pub(super) fn printed(&self, what: &str) -> bool {
-        let printed = std::fs::read(self.log).unwrap_or_default();
+        let printed = std::fs::read(&self.out.log).unwrap_or_default();
         String::from_utf8_lossy(&printed).contains(what)
     }
+}
+
+/// Ends a process, whose database survives that.
+fn end(child: &mut Child) -> std::io::Result<()> {
+    child.kill()?;
+    child.wait().map(drop)
 }
 
 /// What a failed program's error quotes of its lines: from the first error on, or the last.
@@ -148,15 +180,14 @@ fn quoted<'a>(lines: impl Iterator<Item = &'a str>) -> String {
 pub fn how_to_install(name: &str) -> &'static str {
     match name {
         "colmap" => {
-            "Debian, Ubuntu: apt install colmap; Fedora: dnf install colmap; Arch: colmap of the AUR; macOS: \
-             brew install colmap; Windows and others: https://github.com/colmap/colmap/releases"
+            "apt install colmap, dnf install colmap, brew install colmap, or https://github.com/colmap/colmap/releases"
         }
         "glomap" => {
             "https://github.com/colmap/glomap/releases, or COLMAP 4.0 and later, which has it"
         }
         _ => {
-            "Debian, Ubuntu: apt install ffmpeg; Fedora: dnf install ffmpeg-free; Arch: pacman -S ffmpeg; \
-             macOS: brew install ffmpeg; Windows: winget install ffmpeg; others: https://ffmpeg.org/download.html"
+            "apt install ffmpeg, dnf install ffmpeg-free, brew install ffmpeg, winget install ffmpeg, or \
+             https://ffmpeg.org/download.html"
         }
     }
 }

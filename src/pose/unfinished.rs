@@ -4,13 +4,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::lock::FolderLock;
 use nightsplat_core::output::{create_folder, write_whole};
 use nightsplat_photographs::dataset::{Dataset, is_mask, mask_beside};
 use nightsplat_photographs::image::files::{PhotographFiles, photographs_in, stem};
 use nightsplat_photographs::tree;
 
-use super::pictures::PosePhotographs;
-use crate::{Error, Result};
+use super::pictures::{BRIGHT, PosePhotographs};
+use crate::{Error, Result, Stop};
 
 /// Creates a hard link in `folder`, or a copy if the file system has no links.
 fn link_or_copy(from: &Path, folder: &Path) -> Result<()> {
@@ -23,6 +24,8 @@ pub(super) fn link_or_copy_to(from: &Path, to: &Path) -> Result<()> {
         return write_whole(to, &tree::bytes(from)?);
     }
     let from = from.canonicalize().unwrap_or_else(|_| from.to_owned());
+    // Of an earlier call that was killed.
+    let _ = fs::remove_file(to);
     if fs::hard_link(&from, to).is_ok() {
         return Ok(());
     }
@@ -31,7 +34,8 @@ pub(super) fn link_or_copy_to(from: &Path, to: &Path) -> Result<()> {
         .map_err(|error| Error::output(to, format!("cannot be written: {error}")))
 }
 
-/// A dataset under a temporary name, removed unless it is finished.
+/// A dataset under a temporary name, with what its programs have found so far. Another call goes on with what a killed
+/// process left; what failed is removed.
 pub(super) struct Unfinished {
     target: PathBuf,
     replaces: bool,
@@ -41,11 +45,15 @@ pub(super) struct Unfinished {
     pub(super) work: PathBuf,
     /// Output of the programs.
     pub(super) log: PathBuf,
-    is_finished: bool,
+    /// On the folder.
+    pub(super) lock: FolderLock,
+    /// Whether the folder stays: it is the dataset, or another call goes on with it.
+    stays: bool,
 }
 
 impl Unfinished {
-    pub(super) fn new(target: &Path, overwrite: bool) -> Result<Self> {
+    /// Begins a dataset, or goes on with one of the same `origin`: its photographs and options, in a line.
+    pub(super) fn open(target: &Path, overwrite: bool, origin: &str) -> Result<Self> {
         let mut folder = target.as_os_str().to_owned();
         folder.push(".partial");
         let folder = PathBuf::from(folder);
@@ -60,15 +68,48 @@ impl Unfinished {
             };
             return Err(Error::output(target, format!("exists already; {remedy}")));
         }
-        if folder.exists() {
-            let problem = "belongs to an interrupted or running `nightsplat pose`; remove it";
+        if has_files(&folder) && !folder.join(ORIGIN).is_file() {
+            let problem = "is in the way, and not of `nightsplat pose`; remove it";
             return Err(Error::output(folder, problem));
         }
-        let work = folder.join("work");
+        create_folder(&folder)?;
+        let lock = FolderLock::take(&folder)?;
+        let work = folder.join(WORK);
+        if origin_of(&folder).as_deref() != Some(origin) {
+            for name in [WORK, "images", "masks", "sparse", BRIGHT] {
+                // Most of them are absent.
+                let _ = fs::remove_dir_all(folder.join(name));
+            }
+            write_whole(&folder.join(ORIGIN), origin.as_bytes())?;
+        }
         create_folder(&work)?;
         let log = folder.join(LOG);
         let replaces = has_files(target);
-        Ok(Self { target: target.to_owned(), replaces, folder, work, log, is_finished: false })
+        Ok(Self { target: target.to_owned(), replaces, folder, work, log, lock, stays: false })
+    }
+
+    /// The seconds that a stage took, if it is done; work in several calls counts from the last on.
+    pub(super) fn seconds_of(&self, stage: &str) -> Option<f64> {
+        fs::read_to_string(self.mark(stage)).ok()?.trim().parse().ok()
+    }
+
+    /// Records that a stage is done.
+    pub(super) fn done(&self, stage: &str, seconds: f64) -> Result<()> {
+        write_whole(&self.mark(stage), format!("{seconds:.3}\n").as_bytes())
+    }
+
+    fn mark(&self, stage: &str) -> PathBuf {
+        self.work.join(format!("{stage}.done"))
+    }
+
+    /// The error of work that was stopped in a stage.
+    pub(super) fn stopped(&self, stage: &str, cause: Stop) -> Error {
+        Error::StageStopped { folder: self.target.clone(), stage: stage.to_owned(), cause }
+    }
+
+    /// Keeps the folder for another call.
+    pub(super) fn keep(&mut self) {
+        self.stays = true;
     }
 
     /// Adds those of `photographs` that are placed, by their names without extension, to the dataset `below` this one.
@@ -166,9 +207,10 @@ impl Unfinished {
         if self.replaces {
             fs::remove_dir_all(&self.target).map_err(failed)?;
         }
+        self.lock.remove_file();
         // The rename replaces an empty folder.
         fs::rename(&self.folder, &self.target).map_err(failed)?;
-        self.is_finished = true;
+        self.stays = true;
         // The log of an earlier attempt.
         let _ = fs::remove_file(self.kept_log());
         Ok(())
@@ -177,10 +219,19 @@ impl Unfinished {
 
 /// Name of the log in the dataset.
 const LOG: &str = "colmap.log";
+/// The file with the origin of the cameras, in the dataset.
+const ORIGIN: &str = "pose.txt";
+/// The folder of what COLMAP has found so far.
+const WORK: &str = "work";
+
+/// The origin that a dataset of this module records.
+pub(super) fn origin_of(dataset: &Path) -> Option<String> {
+    fs::read_to_string(dataset.join(ORIGIN)).ok()
+}
 
 impl Drop for Unfinished {
     fn drop(&mut self) {
-        if !self.is_finished {
+        if !self.stays {
             // The cause is reported elsewhere; errors of the cleanup are not.
             let _ = fs::rename(&self.log, self.kept_log());
             let _ = fs::remove_dir_all(&self.folder);

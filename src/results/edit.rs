@@ -270,9 +270,9 @@ impl Editor {
             region => *region,
         };
         let name = match region {
-            Region::Box(low, high) => format!("crop to the box from {low} to {high}"),
+            Region::Box(low, high) => format!("crop to the box from {low:.3} to {high:.3}"),
             Region::Sphere(center, radius) => {
-                format!("crop to the sphere at {center} of radius {radius}")
+                format!("crop to the sphere at {center:.3} of radius {radius:.3}")
             }
             Region::Cameras => "crop".to_owned(),
         };

@@ -8,7 +8,6 @@ mod files;
 mod generations;
 mod ledger;
 mod load;
-mod lock;
 mod meter;
 mod progress;
 mod requests;
@@ -20,6 +19,7 @@ pub use directory::{Progress, RunDirectory, load_progress};
 pub use done::{done_steps, done_steps_by_stamp};
 pub use events::{Event, RunSummary};
 pub(crate) use files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE, TRAINED_WITH};
+pub use generations::has_checkpoint;
 pub(crate) use load::{RecordedExposure, load_target_exposure};
 pub use load::{
     is_finished, load_config, load_exposures, load_gaussians, load_lamp, load_metrics,

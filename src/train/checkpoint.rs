@@ -214,7 +214,9 @@ impl Trainer {
         self.supervision.views.set_left_out(&header.left_out);
         (self.clock.step, self.clock.decisions, self.model.best) =
             (header.step, header.decisions, best);
-        self.clock.decisions.goes_on |= begun.steps != self.config.steps;
+        if begun.steps != self.config.steps {
+            (self.clock.decisions.goes_on, self.clock.decisions.finish) = (true, None);
+        }
         if let Some(change) = begun.stop.change(&self.config.stop) {
             tracing::warn!("{change}; this applies from step {} on", self.clock.step);
         }

@@ -2,7 +2,8 @@
 //! held-out views.
 //!
 //! ```text
-//! growth -> converged, or the last steps begin -> cooldown: no density control, learning rates decay -> end
+//! growth -> converged, or the end is requested, or the last steps begin
+//!        -> cooldown: no density control, learning rates decay -> end
 //! ```
 //!
 //! Scores fluctuate with the most recent views and with every round of density control. So they are never taken right
@@ -13,6 +14,7 @@ use std::sync::Arc;
 use super::batching::Submissions;
 use super::config::TrainConfig;
 use super::decisions::{Decisions, HeldOutScore};
+use super::early_stopping::EndReason;
 use crate::splats::optimizer::LearningRates;
 use crate::splats::scene::ATTRIBUTES;
 
@@ -38,16 +40,36 @@ impl RunClock {
         Self { config, step: 0, decisions, has_held_out, submissions }
     }
 
-    /// The last step of the run, as far as known: earlier than configured once the run has converged.
+    /// The last step of the run, as far as known: earlier than configured once the run has converged, or its end was
+    /// requested.
     pub(super) fn last_step(&self) -> u64 {
-        let early =
-            self.converged().map(|converged| converged + self.config.effective_cooldown_steps());
+        let early = self.early_cooldown().map(|from| from + self.config.effective_cooldown_steps());
         early.map_or(self.config.steps, |early| early.min(self.config.steps))
     }
 
-    /// The step at which the run converged, if that ends it.
-    pub(super) fn converged(&self) -> Option<u64> {
-        self.decisions.converged.filter(|_| !self.decisions.goes_on)
+    /// The step at which the run converged, or its end was requested, if that ends it.
+    fn early_cooldown(&self) -> Option<u64> {
+        let Decisions { converged, finish, goes_on, .. } = &self.decisions;
+        converged.filter(|_| !goes_on).or(*finish)
+    }
+
+    /// Lets the run cool down from here and end, unless it does already.
+    pub(super) fn finish(&mut self) {
+        if self.step >= self.cooldown_begin() {
+            return;
+        }
+        self.decisions.finish = Some(self.step);
+        let is_scored = self.decisions.scores.last().is_some_and(|last| last.step == self.step);
+        self.decisions.score_due = self.has_ended() && self.has_held_out && !is_scored;
+    }
+
+    /// What ends the run, as far as known.
+    pub(super) fn end_reason(&self) -> EndReason {
+        match (self.early_cooldown(), self.decisions.finish) {
+            (None, _) => EndReason::Steps,
+            (Some(_), None) => EndReason::Converged,
+            (Some(_), Some(_)) => EndReason::Requested,
+        }
     }
 
     /// Whether the last step is done.
@@ -57,14 +79,14 @@ impl RunClock {
 
     /// Whether the run may end before its last step.
     pub(super) fn may_end_early(&self) -> bool {
-        let is_open = self.converged().is_none() && !self.decisions.goes_on;
+        let is_open = self.early_cooldown().is_none() && !self.decisions.goes_on;
         is_open && self.step < self.cooldown_begin() && self.has_held_out
     }
 
     /// The step after which the cooldown begins.
     pub(super) fn cooldown_begin(&self) -> u64 {
         let planned = self.config.steps - self.config.effective_cooldown_steps();
-        self.converged().map_or(planned, |converged| converged.min(planned))
+        self.early_cooldown().map_or(planned, |from| from.min(planned))
     }
 
     /// The factor of all learning rates of a step.

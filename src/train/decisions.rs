@@ -42,6 +42,9 @@ pub(super) struct Decisions {
     /// The step at which the run converged; it then cools down and ends.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) converged: Option<u64>,
+    /// The step at which the end was requested; the run then cools down and ends.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) finish: Option<u64>,
     /// The run was resumed with another number of steps, and trains all of them.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub(super) goes_on: bool,

@@ -1,4 +1,4 @@
-//! The end of a run: by its last step, or early because its held-out views have stopped improving.
+//! The end of a run: by its last step, or early because its held-out views have stopped improving or it was requested.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,6 +10,8 @@ pub enum EndReason {
     Converged,
     /// All steps are done.
     Steps,
+    /// Somebody requested it.
+    Requested,
 }
 
 /// The end of a run.
@@ -29,6 +31,7 @@ impl std::fmt::Display for Ended {
         let why = match reason {
             EndReason::Converged => "the held-out views have converged",
             EndReason::Steps => "all steps are done",
+            EndReason::Requested => "its end was requested",
         };
         write!(out, "ended at step {step}: {why}")?;
         if best_step == step {

@@ -3,7 +3,7 @@
 use nightsplat_core::camera::Camera;
 
 use super::decisions::{HeldOutScore, PATIENCE, RecordedRound};
-use super::early_stopping::{EndReason, Ended};
+use super::early_stopping::Ended;
 use super::model::TrainedModel;
 use super::rendered::Rendered;
 use super::supervision::Supervision;
@@ -118,7 +118,7 @@ impl Trainer {
             self.score_held_out()?;
         }
         let step = self.clock.step;
-        let reason = self.clock.converged().map_or(EndReason::Steps, |_| EndReason::Converged);
+        let reason = self.clock.end_reason();
         let last = self.clock.decisions.scores.last().filter(|last| last.step == step);
         let lost =
             |best: &HeldOutScore| last.map_or(0.0, |last| (best.score - last.score) as f64 / 1e3);

@@ -121,10 +121,9 @@ pub(super) fn unknown(key: &str) -> Error {
     Error::Usage(format!("no setting is called `{key}`{hint}"))
 }
 
-/// The Levenshtein distance of two names minus the length of their common prefix, so that half a name is close to the
-/// whole.
-fn distance(from: &str, to: &str) -> i64 {
-    let alike = from.chars().zip(to.chars()).take_while(|(from, to)| from == to).count();
+/// The Levenshtein distance of a name to the nearest beginning of another, so that half a name is close to the whole,
+/// and to the whole.
+fn distance(from: &str, to: &str) -> [usize; 2] {
     let to: Vec<char> = to.chars().collect();
     let mut row: Vec<usize> = (0..=to.len()).collect();
     for (deleted, from) in from.chars().enumerate() {
@@ -135,7 +134,7 @@ fn distance(from: &str, to: &str) -> i64 {
             row[column + 1] = replaced.min(diagonal + 1).min(row[column] + 1);
         }
     }
-    row[to.len()] as i64 - alike as i64
+    [row.iter().copied().min().unwrap_or_default(), row[to.len()]]
 }
 
 #[cfg(test)]
@@ -261,6 +260,7 @@ mod tests {
             ("alpha", "tone.alpha"),
             ("stepz", "steps"),
             ("density.gradient", "density.gradient_threshold"),
+            ("density.gradent", "density.gradient_threshold"),
             ("density.foo", "density."),
             ("densty.depth_seeding", "density.depth_seeding"),
             ("stop.not-finite", "stop.not_finite"),

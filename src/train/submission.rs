@@ -98,7 +98,7 @@ impl Trainer {
             }
             let Some(oldest) = in_flight.pop_front() else { break };
             // Steps in flight after a failed one change nothing.
-            if !self.finish(oldest, reports)? {
+            if !self.complete(oldest, reports)? {
                 break;
             }
         }
@@ -174,7 +174,7 @@ impl Trainer {
     }
 
     /// Waits for a submission and reports its steps; false if one must be redone.
-    fn finish(&mut self, submitted: Submitted, reports: &mut Vec<StepReport>) -> Result<bool> {
+    fn complete(&mut self, submitted: Submitted, reports: &mut Vec<StepReport>) -> Result<bool> {
         let Submitted { steps, at, log, status } = submitted;
         let (log, status) = (log.wait()?, Status::from_words(&status.wait()?));
         let count = steps.end() - steps.start() + 1;

@@ -124,7 +124,8 @@ impl Trainer {
         self.clock.step
     }
 
-    /// The last step of the run, as far as known: earlier than configured once the run has converged.
+    /// The last step of the run, as far as known: earlier than configured once the run has converged, or
+    /// [`Trainer::finish`] was called.
     pub fn last_step(&self) -> u64 {
         self.clock.last_step()
     }
@@ -138,6 +139,12 @@ impl Trainer {
     #[doc(hidden)]
     pub fn may_end_early(&self) -> bool {
         self.clock.may_end_early()
+    }
+
+    /// Lets the run end soon: its cooldown begins after the steps done, unless it has begun, and
+    /// [`Trainer::last_step`] is its end. A checkpoint records this.
+    pub fn finish(&mut self) {
+        self.clock.finish();
     }
 
     /// The step after which the cooldown begins: no density control, decaying learning rates.
@@ -230,8 +237,8 @@ impl Trainer {
         let step = self.clock.step;
         if until > step && step < self.config.steps && self.has_ended() {
             return Err(Error::Usage(format!(
-                "the run has ended at step {step}, before step {until}: the held-out views have converged \
-                 (`Trainer::has_ended`)"
+                "the run has ended at step {step}, before step {until}: the held-out views have converged, or its end \
+                 was requested (`Trainer::has_ended`)"
             )));
         }
         match (step + 1).checked_next_multiple_of(self.config.check.every) {

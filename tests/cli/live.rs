@@ -198,8 +198,37 @@ fn a_training_is_paused_saved_and_stopped_from_its_page() {
     assert_eq!(serving.ask("POST", "do/resume").0, 200);
     serving.until("more steps", |state| state["step"].as_u64() > paused["step"].as_u64());
     assert_eq!(serving.ask("POST", "do/stop").0, 200);
+    let stopped = serving.until("stopped", |state| !state["endedBy"].is_null());
+    let told = stopped["endedBy"].as_str().unwrap();
+    assert!(
+        told.starts_with("stopped after step ") && told.contains("--resume --finish"),
+        "{told}"
+    );
     assert_eq!(serving.process.wait().unwrap().code(), Some(130));
     assert!(run.join("checkpoint.safetensors").exists());
+}
+
+#[test]
+fn a_training_is_finished_from_its_page_also_while_it_is_paused() {
+    let folder = tempfile::tempdir().unwrap();
+    let (set, run) = (fixture().set(), folder.path().join("run"));
+    let mut serving =
+        Serving::start(&format!("train {set} --out {} {LONG} --view 0", run.display()));
+    serving.until("a model", |state| state["model"].as_u64() > Some(0));
+    assert_eq!(serving.ask("POST", "do/pause").0, 200);
+    serving.until("paused", |state| state["phase"] == "paused");
+    assert_eq!(serving.ask("POST", "do/finish").0, 200);
+    let cooling = serving.until("its last step", |state| state["steps"].as_u64() < Some(20_000));
+    assert!(cooling["steps"].as_u64() > cooling["step"].as_u64(), "{cooling}");
+    assert!(serving.process.wait().unwrap().success());
+    assert!(run.join("metrics.json").exists());
+}
+
+#[test]
+fn a_page_on_all_addresses_is_opened_at_one_of_them() {
+    let serving = Serving::start(&format!("view {} --listen 0.0.0.0:0", fixture().run()));
+    assert!(!serving.address.ip().is_unspecified(), "{}", serving.address);
+    assert_eq!(serving.ask("GET", "state").0, 200);
 }
 
 /// Holds connections that say nothing, half a request or nonsense, or read nothing of what they ask for.

@@ -6,6 +6,8 @@ mod colours;
 mod keys;
 mod layouts;
 mod levels;
+#[cfg(unix)]
+mod make;
 mod models;
 mod photographs;
 #[cfg(unix)]

@@ -144,7 +144,7 @@ fn a_terminated_batch_saves_its_runs_and_resumes_to_the_same_leaderboard() {
     terminate(&child);
     let (code, stderr) = ended(child);
     assert_eq!(code, 143, "{stderr}");
-    assert!(stderr.contains("terminated with 0 of 2 runs done"), "{stderr}");
+    assert!(stderr.contains("stopped with 0 of 2 runs done (terminated)"), "{stderr}");
     assert!(workspace.path("sweep/curve=linear/checkpoint.safetensors").exists());
     assert!(!workspace.path("sweep/curve=ase/config.toml").exists());
     succeed(&sweep("sweep"));

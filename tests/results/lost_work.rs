@@ -55,7 +55,14 @@ fn a_signal_saves_and_stops_and_the_run_resumes_to_the_same_bits() {
         let _ = child.stdout.take();
         let (status, stderr) = ended(child);
         assert_eq!(status, code, "{stderr}");
-        assert!(stderr.contains(message) && stderr.contains("--resume"), "{stderr}");
+        assert!(!stderr.contains("error"), "stopping is none: {stderr}");
+        let parts = [
+            "stopped after step ",
+            message,
+            ", saved; go on with `nightsplat train ",
+            " --resume --finish`",
+        ];
+        assert!(parts.iter().all(|part| stderr.contains(part)), "{stderr}");
         assert!(
             !workspace.path(&name).join("metrics.json").exists(),
             "the run ended before the signal"
@@ -95,7 +102,39 @@ fn a_run_saves_on_request_and_when_its_checkpoint_is_old_and_continues() {
     send("-INT", &child);
     send("-INT", &child);
     let (code, stderr) = ended(child);
-    assert!(code == 130 && stderr.contains("and saved"), "{code}: {stderr}");
+    assert!(code == 130 && stderr.contains(", saved;"), "{code}: {stderr}");
+}
+
+#[test]
+fn a_run_that_is_to_finish_cools_down_and_is_complete_also_if_it_is_stopped_meanwhile() {
+    let workspace = Workspace::new();
+    refused(&workspace.train("absent", "--resume --finish"), 3, &["absent", "no checkpoint"]);
+    refused(&workspace.train("absent", "--finish"), 2, &["--resume"]);
+    let endless = "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0";
+    let child = begun(&workspace.train("asked", endless));
+    send("-USR2", &child);
+    let (code, stderr) = ended(child);
+    assert_eq!(code, 0, "{stderr}");
+    let metrics: serde_json::Value =
+        serde_json::from_slice(&workspace.read("asked/metrics.json")).unwrap();
+    assert_eq!(metrics["ended"]["reason"], "requested");
+    assert!(metrics["steps"].as_u64().unwrap() < 900_000, "{}", metrics["steps"]);
+    assert!(succeed(&workspace.train("asked", &format!("{endless} --resume"))).contains("is done"));
+
+    let steps = "--steps 900 --hash-every 40";
+    let child = begun(&workspace.train("stopped", steps));
+    send("-INT", &child);
+    assert_eq!(ended(child).0, 130);
+    crate::common::copy(&workspace.path("stopped"), &workspace.path("again"));
+    let told = succeed(&workspace.train("stopped", &format!("{steps} --resume --finish")));
+    assert!(told.contains("its end was requested"), "{told}");
+    // The request is recorded at its first step.
+    let stops = format!("{steps} --resume --max-minutes 0.000001");
+    let first = run(&workspace.train("again", &format!("{stops} --finish")), 75).1;
+    assert!(first.contains("stopped after step") && first.contains("its time was up"), "{first}");
+    while command(&workspace.train("again", &stops)).output().unwrap().status.code() == Some(75) {}
+    assert!(workspace.model("again") == workspace.model("stopped"));
+    assert_eq!(log(&workspace.path("again")), log(&workspace.path("stopped")));
 }
 
 #[test]
@@ -109,7 +148,7 @@ fn a_closed_terminal_saves_and_stops_unless_the_run_was_started_to_outlive_it() 
     let child = begun(&workspace.train("closed", endless));
     send("-HUP", &child);
     let (code, stderr) = ended(child);
-    assert!(code == 129 && stderr.contains("hung up after step"), "{code}: {stderr}");
+    assert!(code == 129 && stderr.contains("(hung up), saved"), "{code}: {stderr}");
     assert!(workspace.path("closed/checkpoint.safetensors").exists());
 
     // As `nohup` starts it.
@@ -124,7 +163,7 @@ fn a_closed_terminal_saves_and_stops_unless_the_run_was_started_to_outlive_it() 
     assert!(child.try_wait().unwrap().is_none(), "it is gone");
     send("-INT", &child);
     let (code, stderr) = ended(child);
-    assert!(code == 130 && stderr.contains("and saved"), "{code}: {stderr}");
+    assert!(code == 130 && stderr.contains(", saved;"), "{code}: {stderr}");
 }
 
 #[test]

@@ -171,6 +171,55 @@ fn a_run_that_converges_settles_and_ends_and_so_does_one_that_is_killed_and_resu
     }
 }
 
+/// After a round of density control that it may not repeat, between rounds, before the first step, and where the
+/// cooldown has begun as planned.
+#[test]
+fn a_run_whose_end_is_requested_cools_down_from_there_and_so_does_one_that_is_killed_and_resumed() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dataset, mut config) = early(folder.path());
+    // It does not converge before.
+    config.stop.every = 1000;
+    let checkpoint = folder.path().join("checkpoint.safetensors");
+    for (from, last, reason) in [
+        (10, 19, EndReason::Requested),
+        (17, 26, EndReason::Requested),
+        (0, 9, EndReason::Requested),
+        (55, 60, EndReason::Steps),
+    ] {
+        let new = || Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
+        let mut whole = new();
+        advance(&mut whole, from);
+        whole.save_checkpoint(&checkpoint).unwrap();
+        whole.finish();
+        assert_eq!((whole.last_step(), whole.may_end_early()), (last, false), "from {from}");
+        let rate = |step| whole.learning_rates(step)[Attribute::Quats];
+        assert!(rate(last) < 0.1 * rate(from.min(51)));
+        // Stopped there, and finished after it was resumed.
+        let mut resumed = new();
+        resumed.restore(&checkpoint).unwrap();
+        resumed.finish();
+        let expected = ended(&mut whole, folder.path());
+        assert!(ended(&mut resumed, folder.path()) == expected, "from {from}");
+        let end = whole.end().unwrap();
+        assert_eq!((end.reason, end.step), (reason, last));
+        // Killed while it cools down: the checkpoint records the request.
+        let mut killed = new();
+        advance(&mut killed, from);
+        killed.finish();
+        advance(&mut killed, from + 3);
+        killed.save_checkpoint(&checkpoint).unwrap();
+        let mut restored = new();
+        restored.restore(&checkpoint).unwrap();
+        assert!(ended(&mut restored, folder.path()) == expected, "from {from}, killed");
+        assert_eq!(restored.end().unwrap(), end);
+        // With more steps, the request is over.
+        let mut longer =
+            Trainer::new(&gpu(), TrainConfig { steps: 70, ..config.clone() }, &dataset).unwrap();
+        longer.restore(&checkpoint).unwrap();
+        assert_eq!(longer.last_step(), 70);
+    }
+}
+
 #[test]
 fn a_run_that_is_resumed_with_other_steps_runs_all_of_them() {
     let folder = tempfile::tempdir().unwrap();

@@ -111,7 +111,7 @@ fn code(error: &Error) -> NspResult {
         },
         Error::DeviceLost { .. } => NSP_ERROR_LOST,
         Error::NotFinite { .. } | Error::ParameterNotFinite { .. } => NSP_ERROR_NOT_FINITE,
-        Error::Stopped { .. } | Error::BatchStopped { .. } => NSP_ERROR_STOPPED,
+        stopped if stopped.is_stop() => NSP_ERROR_STOPPED,
         Error::Vulkan { code, .. } => match vk::Result::from_raw(*code) {
             vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | vk::Result::ERROR_OUT_OF_HOST_MEMORY => {
                 NSP_ERROR_MEMORY

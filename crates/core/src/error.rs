@@ -168,7 +168,7 @@ pub enum Error {
         gaussian: usize,
     },
     /// A run stopped on request, with its state saved.
-    #[error("{}: {cause} after step {step}, and saved; continue with --resume", run.display())]
+    #[error("{}: stopped after step {step} ({cause}), saved; go on with --resume", run.display())]
     Stopped {
         /// The run directory.
         run: PathBuf,
@@ -178,7 +178,7 @@ pub enum Error {
         cause: Stop,
     },
     /// A batch of runs stopped on request; those under way are saved.
-    #[error("{}: {cause} with {done} of {all} runs done; repeat the command to continue", folder.display())]
+    #[error("{}: stopped with {done} of {all} runs done ({cause}); go on with the same command", folder.display())]
     BatchStopped {
         /// The folder of their run directories.
         folder: PathBuf,
@@ -186,6 +186,16 @@ pub enum Error {
         done: usize,
         /// Runs in all.
         all: usize,
+        /// What requested it.
+        cause: Stop,
+    },
+    /// External programs were stopped on request; what they have found is kept.
+    #[error("{}: stopped at {stage} ({cause}), kept; go on with the same command", folder.display())]
+    StageStopped {
+        /// What is not finished.
+        folder: PathBuf,
+        /// What they were doing.
+        stage: String,
         /// What requested it.
         cause: Stop,
     },
@@ -213,6 +223,11 @@ impl Error {
         Self::Output { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
     }
 
+    /// Whether this is no failure: somebody stopped the work, which goes on when the command is repeated.
+    pub fn is_stop(&self) -> bool {
+        matches!(self, Self::Stopped { .. } | Self::BatchStopped { .. } | Self::StageStopped { .. })
+    }
+
     /// The process's exit code, for schedulers: 2 for misuse, 3 for unusable data, 4 for the device and its memory,
     /// those of [`Stop`] for a run that can be resumed, 1 for everything else.
     pub fn exit_code(&self) -> u8 {
@@ -228,7 +243,9 @@ impl Error {
             | Self::DeviceLost { .. }
             | Self::Vulkan { .. }
             | Self::TileLimit { .. } => 4,
-            Self::Stopped { cause, .. } | Self::BatchStopped { cause, .. } => cause.exit_code(),
+            Self::Stopped { cause, .. }
+            | Self::BatchStopped { cause, .. }
+            | Self::StageStopped { cause, .. } => cause.exit_code(),
             Self::Output { .. }
             | Self::NotFinite { .. }
             | Self::ParameterNotFinite { .. }

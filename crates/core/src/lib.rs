@@ -4,6 +4,7 @@
 //! - [`error`]: errors, sorted by what the user can do about them
 //! - [`input`]: files that users name, read whole
 //! - [`output`]: files that appear when complete
+//! - [`lock`]: one process at a time in a folder
 //! - [`csv`]: tables of comma-separated values
 //! - [`table`]: tables of text
 //! - [`ply`]: headers of PLY files
@@ -21,6 +22,7 @@ pub mod error;
 pub mod hash;
 pub mod image;
 pub mod input;
+pub mod lock;
 pub mod output;
 pub mod ply;
 pub mod random;

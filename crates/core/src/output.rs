@@ -89,6 +89,53 @@ pub fn is_same_file(a: &Path, b: &Path) -> bool {
     a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
 }
 
+/// Refuses to write into the photographs that a folder is made from: a folder that is them, that holds them, and unless
+/// `may_be_within` one in them. What does not exist yet counts as where it would be.
+pub fn check_apart(out: &Path, photographs: &Path, may_be_within: bool) -> Result<()> {
+    let (to, from) = (real(out), real(photographs));
+    let relation = if to == from {
+        "is"
+    } else if from.starts_with(&to) {
+        "holds"
+    } else if to.starts_with(&from) && !may_be_within {
+        "lies in"
+    } else {
+        return Ok(());
+    };
+    let (out, photographs) = (out.display(), photographs.display());
+    Err(Error::Usage(format!(
+        "--out {out} {relation} {photographs}, where the photographs are; choose another folder"
+    )))
+}
+
+/// A path without links, as far as it exists.
+fn real(path: &Path) -> PathBuf {
+    let path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    let existing = path.ancestors().find_map(|above| Some((above, above.canonicalize().ok()?)));
+    match existing {
+        Some((above, real)) => real.join(path.strip_prefix(above).unwrap_or(Path::new(""))),
+        None => path,
+    }
+}
+
+/// A duration in one or two units.
+pub fn duration(seconds: f64) -> String {
+    match seconds.round() as u64 {
+        seconds @ 0..60 => format!("{seconds} s"),
+        seconds @ 60..3600 => format!("{} min {} s", seconds / 60, seconds % 60),
+        seconds => format!("{} h {} min", seconds / 3600, seconds % 3600 / 60),
+    }
+}
+
+/// A duration that is estimated: coarse, as it is.
+pub fn about(seconds: f64) -> String {
+    match seconds {
+        ..90.0 => format!("about {:.0} s", 10.0 * (seconds / 10.0).ceil().max(1.0)),
+        ..5400.0 => format!("about {:.0} min", (seconds / 60.0).round()),
+        _ => format!("about {:.1} h", seconds / 3600.0),
+    }
+}
+
 /// Text for a terminal: control characters and those of bidirectional text, which foreign names may contain, are
 /// escaped. Line breaks are kept.
 pub fn printable(text: &str) -> Cow<'_, str> {
@@ -145,5 +192,39 @@ mod tests {
         assert_eq!(printable("größer\nline"), "größer\nline");
         assert_eq!(printable("\u{1b}[31mred\r\u{9b}2J\u{7}"), r"\u{1b}[31mred\r\u{9b}2J\u{7}");
         assert_eq!(one_line("a\nerror: b\u{202e}gnp\u{2069}"), r"a\nerror: b\u{202e}gnp\u{2069}");
+    }
+
+    #[test]
+    fn what_is_written_stays_apart_from_photographs() {
+        let folder = tempfile::tempdir().unwrap();
+        let photos = folder.path().join("photos");
+        std::fs::create_dir(&photos).unwrap();
+        let refused = |out: &Path, within: bool| {
+            check_apart(out, &photos, within).err().map(|error| error.to_string())
+        };
+        for (out, relation) in [
+            (photos.join("."), "is"),
+            (folder.path().to_owned(), "holds"),
+            (photos.join("a/b"), "lies in"),
+        ] {
+            let message = refused(&out, false).unwrap();
+            assert!(message.contains(&format!(" {relation} ")), "{message}");
+        }
+        assert_eq!(refused(&photos.join("run"), true), None);
+        assert_eq!(refused(&folder.path().join("photos-splat/run"), false), None);
+        #[cfg(unix)]
+        {
+            let link = folder.path().join("link");
+            std::os::unix::fs::symlink(&photos, &link).unwrap();
+            assert!(refused(&link, true).unwrap().contains(" is "));
+        }
+    }
+
+    #[test]
+    fn a_duration_has_two_units_at_most_and_an_estimate_one() {
+        let exact = [0.4, 59.4, 60.0, 156.0, 3600.0, 9000.0].map(duration);
+        assert_eq!(exact, ["0 s", "59 s", "1 min 0 s", "2 min 36 s", "1 h 0 min", "2 h 30 min"]);
+        let coarse = [0.4, 51.0, 156.0, 9000.0].map(about);
+        assert_eq!(coarse, ["about 10 s", "about 60 s", "about 3 min", "about 2.5 h"]);
     }
 }

@@ -27,6 +27,7 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::csv;
+use nightsplat_core::lock::FolderLock;
 use nightsplat_core::output::{flush_to_disk, own_file, write_whole};
 use nightsplat_photographs::dataset::{Dataset, Split, View};
 
@@ -34,7 +35,6 @@ use super::backup::{self, Backup};
 use super::files::*;
 use super::generations;
 use super::ledger;
-use super::lock::RunLock;
 pub use super::progress::Progress;
 use super::tensorboard::EventFile;
 use crate::gpu::Gpu;
@@ -59,7 +59,7 @@ pub struct RunDirectory {
     /// The previous run; restored if this is dropped before [`RunDirectory::settle`].
     backup: Backup,
     /// Declared after `backup`: the lock is released after the backup is restored.
-    _lock: RunLock,
+    _lock: FolderLock,
 }
 
 impl RunDirectory {
@@ -67,14 +67,14 @@ impl RunDirectory {
     pub fn check(path: &Path, overwrite: bool) -> Result<()> {
         let used = FILES.iter().find(|file| path.join(file).exists());
         match used.filter(|_| !overwrite) {
-            Some(file) => RunLock::check(path).and(Err(held(path, file))),
+            Some(file) => FolderLock::check(path).and(Err(held(path, file))),
             None => Self::check_resumed(path),
         }
     }
 
     /// Checks that a run can begin or resume here.
     pub fn check_resumed(path: &Path) -> Result<()> {
-        RunLock::check(path)?;
+        FolderLock::check(path)?;
         if let Some(file) = FILES.iter().find(|file| path.join(file).exists())
             && !is_run(path)
         {
@@ -91,9 +91,9 @@ impl RunDirectory {
     }
 
     /// Creates the directory if necessary, locks it, and cleans up after a killed process.
-    pub(crate) fn lock(path: &Path) -> Result<RunLock> {
+    pub(crate) fn lock(path: &Path) -> Result<FolderLock> {
         std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
-        let lock = RunLock::take(path)?;
+        let lock = FolderLock::take(path)?;
         backup::recover(path)?;
         Ok(lock)
     }
@@ -101,7 +101,7 @@ impl RunDirectory {
     /// Writes the configuration into a locked directory. A previous run is kept until [`RunDirectory::settle`].
     pub(super) fn create_locked(
         path: &Path,
-        lock: RunLock,
+        lock: FolderLock,
         config: &TrainConfig,
         overwrite: bool,
     ) -> Result<Self> {
@@ -125,7 +125,7 @@ impl RunDirectory {
     /// Resumes a run after `step`: truncates its log there, and marks it as unfinished.
     pub(super) fn resume(
         path: &Path,
-        lock: RunLock,
+        lock: FolderLock,
         config: &TrainConfig,
         step: u64,
     ) -> Result<Self> {
@@ -154,7 +154,7 @@ impl RunDirectory {
         log: &str,
         seconds_before: f64,
         backup: Backup,
-        lock: RunLock,
+        lock: FolderLock,
     ) -> Result<Self> {
         let recorded = config.clone().with_absolute_paths();
         let config_path = own_file(path.join("config.toml"))?;

@@ -43,7 +43,8 @@ pub enum Event<'a> {
         /// Their mean PSNR, dB.
         psnr: f64,
     },
-    /// The last step is certain: the held-out views have converged, or the run can no longer end early.
+    /// The last step is certain: the held-out views have converged, the end was requested, or the run can no longer end
+    /// early.
     LastStep {
         /// Steps done.
         step: u64,

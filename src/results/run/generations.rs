@@ -12,6 +12,11 @@ fn both(run: &Path) -> [PathBuf; 2] {
     [CHECKPOINT, CHECKPOINT_BEFORE].map(|file| run.join(file))
 }
 
+/// Whether there is a checkpoint.
+pub fn has_checkpoint(run: &Path) -> bool {
+    both(run).iter().any(|path| path.is_file())
+}
+
 /// The checkpoint to resume from: the newest that is intact, else the newest, so that its problem is reported; `None`
 /// if there is none.
 pub(super) fn newest(run: &Path) -> Option<PathBuf> {

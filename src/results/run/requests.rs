@@ -11,6 +11,7 @@ pub struct Requests {
     /// 0, or 1 + the index in [`Stop::ALL`].
     stop: Arc<AtomicUsize>,
     save: Arc<AtomicBool>,
+    finish: Arc<AtomicBool>,
     pause: Arc<AtomicBool>,
     snapshot: Arc<AtomicBool>,
 }
@@ -24,6 +25,25 @@ impl Requests {
     /// Requests to save and continue.
     pub fn save(&self) {
         self.save.store(true, Ordering::Relaxed);
+    }
+
+    /// Requests to end soon: the cooldown begins, then the run is scored and complete.
+    pub fn finish(&self) {
+        self.finish.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether the end was requested.
+    pub(super) fn finishes(&self) -> bool {
+        self.finish.load(Ordering::Relaxed)
+    }
+
+    /// Whether the end was requested since the last call; a pause is over then.
+    pub(super) fn takes_finish(&self) -> bool {
+        let is_asked = self.finish.swap(false, Ordering::Relaxed);
+        if is_asked {
+            self.pause(false);
+        }
+        is_asked
     }
 
     /// Requests to wait before the next steps, or no longer.
@@ -71,6 +91,11 @@ impl Requests {
     pub(crate) fn save_flag(&self) -> &Arc<AtomicBool> {
         &self.save
     }
+
+    /// The flag of [`Requests::finish`], for signal handlers.
+    pub(crate) fn finish_flag(&self) -> &Arc<AtomicBool> {
+        &self.finish
+    }
 }
 
 #[cfg(test)]
@@ -93,5 +118,9 @@ mod tests {
         assert!(requests.is_paused());
         requests.pause(false);
         assert!(!requests.is_paused());
+        requests.pause(true);
+        requests.finish();
+        assert!(requests.finishes() && requests.takes_finish() && !requests.takes_finish());
+        assert!(!requests.is_paused(), "a run that is to end does not wait");
     }
 }

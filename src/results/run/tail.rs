@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use nightsplat_core::csv;
+use nightsplat_core::lock::FolderLock;
 use serde::Serialize;
 
 use super::files::{ENDED, HELD_OUT, LOG};
 use super::load::{is_finished, load_config, load_metrics};
-use super::lock::RunLock;
 
 /// The state of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -93,7 +93,7 @@ impl RunTail {
             let (step, psnr) = line.split_once(',')?;
             Some((step.parse().ok()?, psnr.parse().ok()?))
         };
-        let is_training = RunLock::check(run).is_err();
+        let is_training = FolderLock::check(run).is_err();
         Self {
             phase: match (is_training, is_finished(run)) {
                 (true, _) => Phase::Training,

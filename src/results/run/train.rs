@@ -243,8 +243,8 @@ struct TrainLoop<'a> {
     events: Option<EventFile>,
     /// Number of reported scores of the held-out views.
     told: usize,
-    /// The reported value of whether the run may end early.
-    may_end_early: bool,
+    /// The reported last step, and whether the run may end earlier.
+    end: (u64, bool),
 }
 
 impl<'a> TrainLoop<'a> {
@@ -268,7 +268,7 @@ impl<'a> TrainLoop<'a> {
             score_reference: None,
             events: None,
             told: trainer.held_out_scores().count(),
-            may_end_early: trainer.may_end_early(),
+            end: (trainer.last_step(), trainer.may_end_early()),
         }
     }
 
@@ -287,6 +287,10 @@ impl<'a> TrainLoop<'a> {
         };
         while !trainer.has_ended() {
             self.attend(trainer, directory, requests, observe)?;
+            if requests.takes_finish() {
+                self.finish_early(trainer, directory, observe)?;
+                continue;
+            }
             let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
             let until = [config.eval_every, config.checkpoint_every, config.hash_every];
             let until = until.into_iter().filter_map(next).min().unwrap_or(config.steps);
@@ -345,7 +349,7 @@ impl<'a> TrainLoop<'a> {
                 let seconds = begin.elapsed().as_secs_f64();
                 observe(Event::Snapshot { step, model, seconds });
             }
-            if !requests.is_paused() || requests.stops().is_some() {
+            if !requests.is_paused() || requests.stops().is_some() || requests.finishes() {
                 return Ok(());
             }
             if requests.takes_save() {
@@ -355,6 +359,23 @@ impl<'a> TrainLoop<'a> {
             }
             std::thread::sleep(LOOKS_AGAIN);
         }
+    }
+
+    /// Begins the cooldown, as requested. A checkpoint records the request, unless no step is done.
+    fn finish_early(
+        &mut self,
+        trainer: &mut Trainer,
+        directory: &mut RunDirectory,
+        observe: &mut impl FnMut(Event<'_>),
+    ) -> Result<()> {
+        trainer.finish();
+        let step = trainer.steps_done();
+        if step > 0 {
+            directory.save_checkpoint(trainer)?;
+            self.saved = step;
+            observe(Event::Checkpointed { step });
+        }
+        self.log_scores(trainer, directory, observe)
     }
 
     /// Restores the best model if the last is worse, scores the test views and writes the model.
@@ -495,10 +516,11 @@ impl TrainLoop<'_> {
                     .scalars(step, &[("held-out views against targets/PSNR".to_owned(), psnr)])?;
             }
         }
-        if self.may_end_early && !trainer.may_end_early() {
+        let end = (trainer.last_step(), trainer.may_end_early());
+        if end != self.end && !trainer.may_end_early() {
             observe(Event::LastStep { step: trainer.steps_done(), last: trainer.last_step() });
         }
-        (self.told, self.may_end_early) = (scores.len(), trainer.may_end_early());
+        (self.told, self.end) = (scores.len(), end);
         Ok(())
     }
 

@@ -259,8 +259,11 @@ fn problems_before_the_start_are_reported_in_a_line() {
     }
     (0..9).for_each(|i| photograph(&root.join(format!("black/{}.png", name(i))), SIZE, 0.0));
     let absent = "`/nowhere/colmap` is not found";
-    let remedies = [absent, "apt install colmap", "brew install", "--colmap PATH", "colmap mapper"];
-    refused(&line(&photos, &out, "/nowhere/colmap".as_ref(), ""), 2, &remedies);
+    let remedies = [absent, "apt install colmap", "brew install", "--colmap PATH"];
+    let absent = line(&photos, &out, "/nowhere/colmap".as_ref(), "");
+    refused(&absent, 2, &remedies);
+    assert!(run(&absent, 2).1.len() < 240, "a short line");
+    refused(&format!("{absent} --patience -1"), 2, &["--patience"]);
     let ffmpeg = "--ffmpeg /nowhere/ffmpeg";
     let cases: [(&str, &str, i32, &[&str]); 7] = [
         ("absent", "", 3, &["absent", "cannot be read"]),

@@ -123,6 +123,11 @@ impl DatasetLayout {
     pub(super) fn no_dataset(&self) -> String {
         let root = &self.root;
         let expected = "transforms_train.json, transforms.json or a COLMAP model in sparse/0";
+        if let Some(dataset) = dataset_of_run(root) {
+            return format!(
+                "is a run, not a dataset; the dataset that it was trained on is {dataset}"
+            );
+        }
         if let Some(below) = self.below() {
             return format!("holds no dataset, but {} does: name that", below.display());
         }
@@ -136,8 +141,8 @@ impl DatasetLayout {
         match photographs_in(root).map_or(0, |photographs| photographs.len()) {
             0 => format!("holds no dataset; expected {expected}"),
             count => format!(
-                "holds no dataset but {count} photographs, whose poses are not known; find them with \
-                 `nightsplat pose {} --out DATASET` (expected {expected})",
+                "holds no dataset but {count} photographs, whose poses are not known; `nightsplat {0}` finds them and \
+                 trains, `nightsplat pose {0} --out DATASET` finds them alone (expected {expected})",
                 root.display()
             ),
         }
@@ -151,6 +156,14 @@ impl DatasetLayout {
             first.into_iter().chain(second).map(|root| Self { root, named: None, block: None });
         below.find(Self::has_listing).map(|layout| layout.root)
     }
+}
+
+/// The dataset that a run directory names; `None` of a folder that is none.
+fn dataset_of_run(folder: &Path) -> Option<String> {
+    let config = std::fs::read_to_string(folder.join("config.toml")).ok()?;
+    let table: toml::Table = config.parse().ok()?;
+    let is_run = ["steps", "seed", "tone"].iter().all(|key| table.contains_key(*key));
+    table.get("dataset").and_then(toml::Value::as_str).filter(|_| is_run).map(str::to_owned)
 }
 
 /// The files that a model needs to list photographs with cameras.

@@ -77,7 +77,7 @@ async function follow(show) {
   const source = await (await asked('')).text();
   const order = async (what) => { await fetch(`do/${what}`, { method: 'POST' }); await look(); };
   element('pause').addEventListener('click', () => order(isPaused ? 'resume' : 'pause'));
-  for (const what of ['save', 'stop']) element(what).addEventListener('click', () => order(what));
+  for (const what of ['save', 'finish', 'stop']) element(what).addEventListener('click', () => order(what));
   element('exportPage').addEventListener('click', async () => {
     download('model.html', new Blob([await sharedPage(source, buffer)], { type: 'text/html' }));
   });
