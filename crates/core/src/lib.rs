@@ -3,6 +3,7 @@
 //!
 //! - [`error`]: errors, sorted by what the user can do about them
 //! - [`input`]: files that users name, read whole
+//! - [`natural`]: the order of names as people count
 //! - [`output`]: files that appear when complete
 //! - [`csv`]: tables of comma-separated values
 //! - [`table`]: tables of text
@@ -21,6 +22,7 @@ pub mod error;
 pub mod hash;
 pub mod image;
 pub mod input;
+pub mod natural;
 pub mod output;
 pub mod ply;
 pub mod random;
