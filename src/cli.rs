@@ -77,7 +77,7 @@ const EXAMPLES: &str = "Start with:
   nightsplat eval run --save-images                 score it where there are references
   nightsplat compare run1 run2 --report page.html   runs side by side
   nightsplat render run --split all --out pictures  see the model from every camera
-  nightsplat export run --format html                   a page with the splat to fly through
+  nightsplat export run --format html               a page with the splat to fly through
   nightsplat view run                               the same while it trains, in a browser
   nightsplat edit run --floaters --out clean.ply    crop, clean, transform and merge models
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
@@ -146,9 +146,9 @@ impl Cli {
     /// Runs the command.
     pub fn run(self) -> Result<()> {
         match self.command {
-            Command::Make(args) => make::run(&args),
-            Command::Train(args) => train::run(&args),
-            Command::Diagnose(args) => diagnose::run(&args),
+            Command::Make(args) => make::run(&args, self.verbose > 0),
+            Command::Train(args) => train::run(&args, self.verbose > 0),
+            Command::Diagnose(args) => diagnose::run(&args, self.verbose > 0),
             Command::Pose(args) => pose::run(&args),
             Command::Eval(args) => eval::run(&args),
             Command::Compare(args) => compare::run(&args),
@@ -186,6 +186,12 @@ fn finish(wrote: &str, next: &str) {
     let wrote =
         if wrote.is_empty() { String::new() } else { format!("wrote {}\n", one_line(wrote)) };
     tell(format_args!("{wrote}next: {}", one_line(next)));
+}
+
+/// A run or a model as words of a command, with the dataset that was named for it.
+fn with_dataset(run: &Path, dataset: Option<&Path>) -> String {
+    let dataset = dataset.map(|dataset| format!(" --dataset {}", word(dataset)));
+    word(run) + &dataset.unwrap_or_default()
 }
 
 /// A path as a word of a command.

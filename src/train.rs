@@ -35,6 +35,7 @@ mod rendered;
 mod scoring;
 pub mod settings;
 mod start;
+mod stated;
 mod streams;
 mod submission;
 mod supervision;

@@ -15,7 +15,7 @@ use crate::results::comparison::{CompareOptions, RunComparison};
 /// Compare runs or models on the test views of one dataset.
 ///
 /// Renders the test views of each and scores them against the same images: the references or, without any, the targets
-/// of the first run. Prints a row per run and, for every view, the PSNR of the first run and the gains of the others.
+/// of the first run; a model file states the tone curve and the size of its run. Prints a row per run and, for every view, the PSNR of the first run and the gains of the others.
 /// The page adds the settings that differ, and renders side by side, the most different views first.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
@@ -32,6 +32,9 @@ pub struct CompareArgs {
     /// Dataset, if it moved since training [default: the runs']
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
+    /// Score models that do not state their tone curve against the dark photographs, even if they are brighter
+    #[arg(long)]
+    pub photographs: bool,
     /// Add LPIPS, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)
     #[arg(long, value_name = "WEIGHTS")]
     pub lpips: Option<PathBuf>,
@@ -59,6 +62,7 @@ pub fn run(args: &CompareArgs) -> Result<()> {
         opener: opener(args.device.as_ref()),
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),
         with_pictures: args.report.is_some(),
+        photographs: args.photographs,
     };
     let comparison = RunComparison::new(&args.runs, &options)?;
     let mut wrote = String::new();

@@ -8,7 +8,7 @@ use nightsplat_core::output::{one_line, write_whole};
 use nightsplat_photographs::dataset::DOWNSCALE;
 use nightsplat_photographs::tree::check_writable;
 
-use super::{finish, opener, print, progress_bar, word};
+use super::{finish, opener, print, progress_bar, with_dataset};
 use crate::Error;
 use crate::gpu::DeviceChoice;
 use crate::networks::lpips::Range;
@@ -44,7 +44,8 @@ pub struct EvalArgs {
     #[arg(long)]
     pub align: bool,
     /// Add the scores of the renders as dark photographs, against the photographs of the test views: PSNR, by how many
-    /// stops the render is brighter, and by how much the tone curve, which multiplies differences, raises that PSNR
+    /// stops the render is brighter, and by how much the tone curve, which multiplies differences, raises that PSNR. A
+    /// model that does not state its tone curve is scored against them alone
     #[arg(long)]
     pub photographs: bool,
     /// Add LPIPS, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)
@@ -127,7 +128,8 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     print(scored.evaluation.table().text())?;
     scored.notes().iter().try_for_each(|note| print(one_line(note)))?;
     let wrote = args.report.iter().chain(&images).map(|path| path.display().to_string());
-    let next = format!("nightsplat render {} --split all --out pictures", word(&args.run));
+    let run = with_dataset(&args.run, args.dataset.as_deref());
+    let next = format!("nightsplat render {run} --split all --out pictures");
     finish(&wrote.collect::<Vec<_>>().join(", "), &next);
     Ok(())
 }

@@ -67,8 +67,8 @@ const EXAMPLES: &str = "Examples:
   nightsplat photos --downscale 2 --preset draft        a first look, sooner
   nightsplat photos --finish                            enough: end the stopped training, write the page";
 
-/// Runs the stages that are left.
-pub fn run(args: &MakeArgs) -> Result<()> {
+/// Runs the stages that are left; `everything`: prints also what the plan leaves off.
+pub fn run(args: &MakeArgs, everything: bool) -> Result<()> {
     let made = MadePaths::new(&args.photos, args.out.as_deref())?;
     if args.finish && !has_checkpoint(&made.run) {
         let problem = "has no checkpoint to finish from; without --finish, the training goes on";

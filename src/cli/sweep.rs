@@ -57,7 +57,8 @@ use crate::train::{Part, TrainConfig, diagnosed};
 pub struct SweepArgs {
     /// Dataset, as for `train`
     pub dataset: PathBuf,
-    /// More datasets: each is swept in its own folder of OUT, and OUT/scenes.md has a column for each and their mean
+    /// More datasets: each is swept in its own folder of OUT, and OUT/index.html and OUT/scenes.md have a column for
+    /// each and their mean
     #[arg(value_name = "DATASET")]
     pub more: Vec<PathBuf>,
     /// Folder for the run directories, index.html, costs.html and tables as CSV
@@ -111,8 +112,9 @@ pub fn run(args: &SweepArgs) -> Result<()> {
     if !args.more.is_empty() {
         return scenes::run(args);
     }
-    let dataset = args.dataset.display();
-    run_titled(args, &format!("Sweep of {dataset}"), &[], &[])
+    let dataset = std::path::absolute(&args.dataset)?;
+    let name = dataset.file_name().unwrap_or_default().to_string_lossy();
+    run_titled(args, &format!("Sweep of {name}"), &[], &[])
 }
 
 /// As [`run`], with a title, an introduction and links for the page.

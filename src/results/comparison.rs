@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::natural;
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::metrics::Scores;
@@ -49,6 +50,8 @@ pub(crate) struct CompareOptions<'a> {
     pub(crate) lpips: Option<(&'a Path, Range)>,
     /// Whether images are kept.
     pub(crate) with_pictures: bool,
+    /// Whether a bright model may be scored against dark photographs.
+    pub(crate) photographs: bool,
 }
 
 impl RunComparison {
@@ -58,11 +61,25 @@ impl RunComparison {
         let names = names(paths);
         let mut first: Option<(Dataset, ScoreReference)> = None;
         let mut comparison = Self { runs: vec![], measure: None, pictures: vec![] };
+        let mut targets = None;
         for (path, name) in paths.iter().zip(names) {
+            // Of a model file, the views are those of the first.
+            let stated: Option<String> = targets.clone().filter(|_| is_model(path));
+            let change = |config: &mut TrainConfig| {
+                let changed = stated.and_then(|stated| config.with_targets(&stated).ok());
+                *config = changed.unwrap_or_else(|| config.clone());
+            };
+            let opened = FinishedRun::open_lit(path, options.dataset, &options.opener, change)?;
+            let states_targets = opened.states_targets;
             let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, .. } =
-                FinishedRun::open_lit(path, options.dataset, &options.opener)?;
+                opened;
             if first.is_none() {
                 let reference = ScoreReference::new(&gpu, &config.tone, &dataset)?;
+                if !states_targets && !options.photographs {
+                    reference
+                        .check_brightness(path, &dataset, |view| model_renderer.render(view))?;
+                }
+                targets = config.stated_targets();
                 first = Some((dataset.clone(), reference));
             }
             let Some((first_dataset, reference)) = &mut first else { continue };
@@ -134,6 +151,7 @@ impl RunComparison {
             label: "run".to_owned(),
             columns,
             rows: self.runs.iter().map(row).collect(),
+            ..NumberTable::default()
         }
     }
 
@@ -147,6 +165,8 @@ impl RunComparison {
         let psnr = |run: &Compared, view: &str| {
             run.evaluation.value(Some(view), Metric::Psnr, After::Model)
         };
+        let mut views = first.evaluation.views();
+        views.sort_by(|a, b| natural::compare(a, b));
         let row = |view: &str| {
             let of_first = psnr(first, view);
             let gain = |run: &Compared| Some(psnr(run, view)? - of_first?);
@@ -157,7 +177,8 @@ impl RunComparison {
             title: "Test views".to_owned(),
             label: "view".to_owned(),
             columns,
-            rows: first.evaluation.views().into_iter().map(row).collect(),
+            rows: views.into_iter().map(row).collect(),
+            ..NumberTable::default()
         }
     }
 

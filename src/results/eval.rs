@@ -11,7 +11,7 @@ use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
 use nightsplat_photographs::metrics::{self, Scores, psnr_of_counted};
 use nightsplat_photographs::scene_tone::SceneTone;
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
 
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
@@ -138,6 +138,36 @@ impl ScoreReference {
             _ => View::has_photograph,
         };
         dataset.test_views().filter(|view| has_target(view)).count()
+    }
+
+    /// Refuses to score a bright model against dark photographs for want of anything else.
+    ///
+    /// # Errors
+    /// [`Error::Input`] naming `path` if the photographs are what it is scored against, and its render of the first is
+    /// much brighter.
+    pub(crate) fn check_brightness(
+        &self,
+        path: &Path,
+        dataset: &Dataset,
+        mut render: impl FnMut(&View) -> Result<Rendered>,
+    ) -> Result<()> {
+        /// Of the render relative to the photograph.
+        const BRIGHT: f64 = 1.5;
+        let first = dataset.test_views().find(|view| view.has_photograph());
+        let Some(view) = first.filter(|_| self.against == ReferenceKind::Photographs) else {
+            return Ok(());
+        };
+        let Some(photograph) = view.loaded()? else { return Ok(()) };
+        let mean = |image: &Image| f64::from(Statistics::new(&image.data).mean_luminance);
+        let times = mean(render(view)?.output()) / mean(&photograph).max(f64::MIN_POSITIVE);
+        if times < BRIGHT {
+            return Ok(());
+        }
+        let problem = format!(
+            "is {times:.1} times as bright as the photographs and does not state their tone curve: a score against \
+             them favours dark corners; pass its run, or --photographs to score it against them all the same"
+        );
+        Err(Error::input(path, problem))
     }
 
     /// The image that a view is scored against, in 8 bits.

@@ -14,7 +14,7 @@ use super::eval::{
 };
 use super::finished_run::{FinishedRun, Opener, is_model};
 use super::report::{Chart, Comparison, Picture, Report, Series};
-use super::run;
+use super::{run, verdict};
 use crate::Result;
 use crate::networks::lpips::{Lpips, Range};
 use crate::train::{TrainConfig, known_stops};
@@ -72,8 +72,10 @@ impl RunEvaluation {
             config.reference = options.reference.map(Path::to_owned).or(config.reference.take());
             config.downscale = options.downscale.unwrap_or(config.downscale);
         };
-        let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, lamp } =
-            FinishedRun::open_with(run, options.dataset, &options.opener, change)?;
+        let opened = FinishedRun::open_with(run, options.dataset, &options.opener, change)?;
+        let states_targets = opened.states_targets;
+        let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, lamp, .. } =
+            opened;
         model_renderer.set_lamp(lamp)?;
         let lpips = options.lpips.map(|(weights, range)| Lpips::load(&gpu, weights, range));
         let lpips = lpips.transpose()?;
@@ -86,6 +88,9 @@ impl RunEvaluation {
             stops: known_stops(&dataset, &config)?,
         };
         let mut reference = ScoreReference::new(&gpu, &config.tone, &dataset)?;
+        if !states_targets && !options.photographs {
+            reference.check_brightness(run, &dataset, |view| model_renderer.render(view))?;
+        }
         let (count, mut index) = (reference.view_count(&dataset), 0);
         let is_even = reference.is_evenly_lit(&dataset);
         let render = |view: &View| {
@@ -166,16 +171,14 @@ impl RunEvaluation {
         if let [worst, _, ..] = &mut comparisons[..] {
             worst.title = format!("The worst view, {}", worst.title);
         }
-        let mean = |metric| evaluation.mean(metric, After::Model);
-        let mean = mean(Metric::Psnr).zip(mean(Metric::Ssim)).map(|(psnr, ssim)| {
-            let views = evaluation.views().len();
-            format!("Mean over {views} test views: {psnr:.2} dB, SSIM {ssim:.3}.")
-        });
+        let verdict = verdict::of_model(evaluation).map(|sentence| sentence + ".");
+        let lpips = evaluation.lpips.zip(evaluation.mean(Metric::Lpips, After::Model));
+        let lpips = lpips.map(|(measure, mean)| format!("{}: {mean:.4}.", measure.title()));
         let shown = format!("Images of {} views, the worst first.", comparisons.len());
         let against = evaluation.label().map(|label| format!("Scores are {label}."));
         Report {
             title: format!("Evaluation of {}", self.run.display()),
-            intro: mean.into_iter().chain(against).chain([shown]).collect(),
+            intro: verdict.into_iter().chain(lpips).chain(against).chain([shown]).collect(),
             tables: vec![evaluation.table()],
             charts: history(&self.run),
             comparisons,

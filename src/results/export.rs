@@ -213,7 +213,7 @@ impl Provenance {
 
     /// The facts for a file of `gaussians`, with their origin.
     fn facts_of(&self, gaussians: &Gaussians) -> ModelFacts {
-        ModelFacts { origin: gaussians.origin, ..self.facts }
+        ModelFacts { origin: gaussians.origin, ..self.facts.clone() }
     }
 
     /// A header line that maps the file's positions to the dataset's world, if they differ. `half_turned`: the file's

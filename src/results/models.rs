@@ -50,6 +50,10 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, ModelFacts)> {
         None if path.extension().is_some_and(|ending| ending == "splat" || ending == "ksplat") => {
             Err(format!("is neither PLY, SPZ nor SOG; {CONVERTER}"))
         }
+        None if path.extension().is_some_and(|ending| ending == "html") => {
+            let problem = "is a page, not a model; pass the run or the model that it was made of";
+            Err(problem.to_owned())
+        }
         None => Err("is not a model: neither PLY, SPZ nor SOG".to_owned()),
     };
     let (mut gaussians, facts) = parsed.map_err(|problem| Error::input(path, problem))?;
@@ -70,7 +74,7 @@ pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, M
     }
     let file = PartFile::open(path, part)?;
     Ok(file.map(|file| {
-        let facts = *file.facts();
+        let facts = file.facts().clone();
         warn_of(path, &facts);
         (file, facts)
     }))

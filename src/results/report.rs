@@ -7,6 +7,7 @@ use nightsplat_photographs::image::Image;
 pub use self::chart::{Chart, Mark, Series, VerticalLine};
 pub(crate) use self::data_uri::{base64, jpeg, jpeg_of_quality};
 pub use self::distribution::{Distribution, distributions};
+pub use self::sheet::ContactSheet;
 pub use self::table::{Best, Column, NumberTable};
 
 mod axis;
@@ -14,6 +15,7 @@ mod chart;
 mod data_uri;
 mod distribution;
 mod labels;
+mod sheet;
 mod table;
 
 /// A page. All text is escaped.
@@ -25,6 +27,8 @@ pub struct Report {
     pub intro: Vec<String>,
     /// Links under the introduction: address and text.
     pub links: Vec<[String; 2]>,
+    /// Contact sheets, in order.
+    pub sheets: Vec<ContactSheet>,
     /// Rows of images, in order.
     pub comparisons: Vec<Comparison>,
     /// Tables of text, in order.
@@ -90,18 +94,19 @@ impl Report {
         self.tables.iter().map(NumberTable::html).collect()
     }
 
-    fn charts_html(&self) -> String {
+    pub(crate) fn charts_html(&self) -> String {
         let figure = |chart: &Chart| format!("<figure class=\"plot\">{}</figure>\n", chart.svg());
         let plots: String = self.charts.iter().map(figure).collect();
         if plots.is_empty() { plots } else { format!("<div class=\"plots\">\n{plots}</div>\n") }
     }
 
     fn pictures_html(&self) -> String {
-        self.comparisons.iter().map(Comparison::html).collect()
+        let sheets = self.sheets.iter().map(ContactSheet::html);
+        sheets.chain(self.comparisons.iter().map(Comparison::html)).collect()
     }
 
     /// The page around its body.
-    fn page(&self, body: &str) -> String {
+    pub(crate) fn page(&self, body: &str) -> String {
         let title = escape(&self.title);
         let mut html = format!(
             "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\

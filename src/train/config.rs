@@ -415,6 +415,7 @@ impl TrainConfig {
             max_alpha: Some(max_alpha),
             raw_colors: Some(raw_colors),
             antialiased,
+            targets: self.stated_targets(),
             ..ModelFacts::default()
         }
     }

@@ -71,12 +71,13 @@ fn curves_are_drawn_with_the_statistics_of_a_dataset() {
 }
 
 #[test]
-fn a_plot_without_names_shows_six_curves_and_explains_how_to_choose_others() {
+fn a_plot_without_names_shows_every_curve_that_is_listed() {
     let folder = tempfile::tempdir().unwrap();
     let svg = folder.path().join("curves.svg");
     let message = printed(&format!("--plot {}", svg.display()));
-    assert!(message.contains("6 curves; name curves to plot others"), "{message}");
-    assert_eq!(std::fs::read_to_string(svg).unwrap().matches("<polyline").count(), 6);
+    let all = FAMILIES.len() + 1;
+    assert!(message.contains(&format!("{all} curves")), "{message}");
+    assert_eq!(std::fs::read_to_string(svg).unwrap().matches("<polyline").count(), all);
 }
 
 #[test]

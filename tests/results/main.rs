@@ -8,6 +8,7 @@ mod common;
 mod compare;
 mod determinism;
 mod edit;
+mod edited;
 mod export;
 mod floaters;
 mod injected;

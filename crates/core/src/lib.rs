@@ -3,6 +3,7 @@
 //!
 //! - [`error`]: errors, sorted by what the user can do about them
 //! - [`input`]: files that users name, read whole
+//! - [`natural`]: the order of names as people count
 //! - [`output`]: files that appear when complete
 //! - [`lock`]: one process at a time in a folder
 //! - [`csv`]: tables of comma-separated values
@@ -23,6 +24,7 @@ pub mod hash;
 pub mod image;
 pub mod input;
 pub mod lock;
+pub mod natural;
 pub mod output;
 pub mod ply;
 pub mod random;

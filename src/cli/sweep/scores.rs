@@ -22,7 +22,7 @@ pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range)
             continue;
         }
         let FinishedRun { gpu, config, dataset, mut model_renderer, .. } =
-            FinishedRun::open_lit(run, None, &opener(None))?;
+            FinishedRun::open_lit(run, None, &opener(None), |_| {})?;
         let lpips = Lpips::load(&gpu, weights, range)?;
         let mut reference = ScoreReference::new(&gpu, &config.tone, &dataset)?;
         let is_even = reference.is_evenly_lit(&dataset);

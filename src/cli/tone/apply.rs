@@ -7,7 +7,6 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::output::{create_folder, one_line};
-use nightsplat_core::table::aligned;
 use nightsplat_photographs::dataset::{Dataset, Split};
 use nightsplat_photographs::findings::findings;
 use nightsplat_photographs::image::{ColourCounts, Image, Mask, Orientation, PictureFile};
@@ -23,6 +22,7 @@ use serde::Serialize;
 use self::page::TonePage;
 use self::photographs::{InputPhotograph, listed};
 use crate::cli::settings::{CurveOptions, Selection, SettingOptions};
+use crate::cli::tell::wrapped;
 use crate::cli::{OutputFormat, finish, print, progress_bar, word, words};
 use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
@@ -54,7 +54,7 @@ pub struct ApplyArgs {
     /// Print JSON instead of a table
     #[arg(long)]
     pub json: bool,
-    /// Write a page with measurements, histograms and images
+    /// Write a page with all photographs, dark and lit, measurements and histograms
     #[arg(long, value_name = "FILE.html")]
     pub report: Option<PathBuf>,
     /// More curves for the page
@@ -199,7 +199,7 @@ pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
     if args.json {
         return Ok(print(serde_json::to_string_pretty(&output)?)?);
     }
-    print(text_table(&output))?;
+    print(text(&output))?;
     let images =
         args.out.as_ref().map(|out| format!("{} images to {}", output.views.len(), out.display()));
     let wrote: Vec<String> = images
@@ -216,36 +216,16 @@ pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn text_table(output: &ToneOutput) -> String {
-    let heading = "name p10 p90 r delta0 Y skewness -> Y skewness near_white PSNR SSIM";
-    let mut rows = vec![heading.split(' ').map(|name| name.replace('_', " ")).collect::<Vec<_>>()];
-    let views = output.views.iter().map(|(name, report)| (name.as_str(), report));
-    for (name, report) in views.chain([("scene", &output.scene)]) {
-        let ToneReport { before, delta0, after, scores, .. } = report;
-        let score =
-            |value: fn(&Scores) -> String| scores.as_ref().map_or_else(|| "-".to_owned(), value);
-        rows.push(vec![
-            name.to_owned(),
-            format!("{:.4}", before.p10),
-            format!("{:.4}", before.p90),
-            format!("{:.3}", before.r),
-            format!("{delta0:.4}"),
-            format!("{:.4}", before.mean_luminance),
-            format!("{:.2}", before.skewness),
-            String::new(),
-            format!("{:.4}", after.mean_luminance),
-            format!("{:.2}", after.skewness),
-            format!("{:.1} %", 100.0 * after.near_white_fraction),
-            score(|scores| format!("{:.2}", scores.psnr)),
-            score(|scores| format!("{:.3}", scores.ssim)),
-        ]);
-    }
-    let remarks: String =
-        output.remarks.iter().map(|remark| format!("note: {}\n", one_line(remark))).collect();
-    let reason = output.exposure.as_ref().map(|exposure| format!("{}\n", exposure.reason()));
+fn text(output: &ToneOutput) -> String {
+    let remarks: String = output
+        .remarks
+        .iter()
+        .map(|remark| wrapped(&format!("note: {}", one_line(remark)), 6))
+        .collect();
+    let reason = output.exposure.as_ref().map(|exposure| wrapped(&exposure.reason(), 0));
     let label = output.with_reference.as_deref().map(eval::with_reference);
     let label = label.map(|line| line + "\n").unwrap_or_default();
-    reason.unwrap_or_default() + &aligned(&rows) + &remarks + &label
+    reason.unwrap_or_default() + &page::table(output).text() + &remarks + &label
 }
 
 /// Maps every photograph and writes it to `args.out` under its own name. Of several photographs, unusable ones are

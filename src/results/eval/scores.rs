@@ -1,5 +1,6 @@
 //! The scores of test views, a row each.
 
+use nightsplat_core::natural;
 use nightsplat_photographs::metrics::Scores;
 use nightsplat_photographs::tone::ToneSettings;
 use serde_json::{Map, Value, json};
@@ -289,11 +290,14 @@ impl Evaluation {
             (view.unwrap_or("mean").to_owned(), values.collect())
         };
         let mean = (!self.scores.is_empty()).then_some(None);
+        let mut views = self.views();
+        views.sort_by(|a, b| natural::compare(a, b));
         NumberTable {
             title: "Test views".to_owned(),
             label: "view".to_owned(),
             columns: shown.iter().map(column).collect(),
-            rows: self.views().into_iter().map(Some).chain(mean).map(row).collect(),
+            rows: views.into_iter().map(Some).chain(mean).map(row).collect(),
+            ..NumberTable::default()
         }
     }
 }
