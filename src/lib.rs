@@ -202,7 +202,7 @@ pub use splats::scene::{DeviceGaussians, Features, GaussianSlice, Gaussians, Lay
 #[cfg(feature = "train")]
 #[doc(inline)]
 pub use nightsplat_photographs::{
-    dataset::{Dataset, DepthOptions, LoadOptions, Original, Point, Split, View},
+    dataset::{Dataset, DepthOptions, LoadOptions, Original, Point, RowBands, Split, View},
     image::{ImageFile, Mask, Orientation},
     metrics::Scores,
     tone::{Profile, Table, Tone, ToneCurve, ToneSettings},

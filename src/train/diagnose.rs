@@ -38,8 +38,8 @@ use crate::{Error, Result};
 use geometry::SceneGeometry;
 pub(super) use geometry::exposures_at_points;
 pub(crate) use geometry::median;
-pub use lamp::{LampDiagnosis, falloff::FalloffDiagnosis};
-use lamp::{LampObservations, bands};
+use lamp::LampObservations;
+pub use lamp::{LampDiagnosis, bands::BandsDiagnosis, falloff::FalloffDiagnosis};
 pub use noise::ChannelNoise;
 use photograph::PhotographStatistics;
 pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
@@ -148,6 +148,8 @@ pub struct SceneDiagnosis {
     pub lamp_unknown: Option<String>,
     /// The fall-off of the lens, before it was corrected; `None` if the points do not show it.
     pub falloff: Option<FalloffDiagnosis>,
+    /// Bands of rows, before they were corrected; `None` if the points do not show them.
+    pub bands: Option<BandsDiagnosis>,
 }
 
 /// The diagnosis of a capture.
@@ -177,17 +179,27 @@ pub struct Diagnosis {
 
 impl Diagnosis {
     /// Loads a dataset and diagnoses its training photographs, as stored, while they are decoded. Where the corners of
-    /// a lens are dark, and `options` do not say its fall-off, the photographs are loaded again without it.
+    /// a lens are dark or rows differ, and `options` do not say by how much, the photographs are loaded again without
+    /// it.
     pub fn load(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
         let (dataset, diagnosis) = Self::load_with(root, options)?;
-        let found = diagnosis.scene.falloff.filter(FalloffDiagnosis::is_found);
-        let Some(found) = found.filter(|_| options.falloff.is_none()) else {
+        let SceneDiagnosis { falloff, bands, .. } = &diagnosis.scene;
+        let falloff = falloff.filter(|found| options.falloff.is_none() && found.is_found());
+        let bands = bands.clone().filter(|found| options.bands.is_none() && found.is_found());
+        if falloff.is_none() && bands.is_none() {
             return Ok((dataset, diagnosis));
-        };
+        }
         drop(dataset);
-        let options = LoadOptions { falloff: Some(found.falloff), ..options.clone() };
+        let mut options = options.clone();
+        options.falloff = options.falloff.or(falloff.map(|found| found.falloff));
+        options.bands = options.bands.or(bands.as_ref().map(|found| found.rows.clone()));
         let (dataset, mut diagnosis) = Self::load_with(root, &options)?;
-        diagnosis.scene.falloff = Some(FalloffDiagnosis { is_corrected: true, ..found });
+        if let Some(found) = falloff {
+            diagnosis.scene.falloff = Some(FalloffDiagnosis { is_corrected: true, ..found });
+        }
+        if let Some(found) = bands {
+            diagnosis.scene.bands = Some(BandsDiagnosis { is_corrected: true, ..found });
+        }
         Ok((dataset, diagnosis))
     }
 
@@ -246,8 +258,11 @@ impl Diagnosis {
         let diagnosed: Vec<ViewDiagnosis> = photographs.iter().enumerate().map(of_view).collect();
         let without_pose = without_pose(&paths, &files, dataset)?;
         let (mut remarks, odd) = remarks(&diagnosed, &photographs, &views, &without_pose);
+        let names: Vec<&str> = views.iter().map(|(_, view)| view.name.as_str()).collect();
         let tracks = LampObservations::new(&shared.observations, views.len());
-        remarks.extend(tracks.as_ref().ok().and_then(bands::remark));
+        let bands = tracks.as_ref().ok().map(|tracks| BandsDiagnosis::new(tracks, &names));
+        let (bands, in_tracks) = bands.unzip();
+        let tracks = tracks.map(|tracks| tracks.without(&in_tracks.unwrap_or_default()));
         remarks.extend(findings(&measured, Some(&exposure), 0.0));
         let mut scene = SceneDiagnosis::new(
             &diagnosed,
@@ -257,6 +272,7 @@ impl Diagnosis {
             &exposure,
             dataset.points.len(),
         );
+        scene.bands = bands;
         scene.brought_near_white = brought_near_white(&measured, &exposure);
         // A pixel of a resized target averages this many pixels in each direction.
         let shrink = diagnosed.iter().zip(&views).map(|(view, (_, of))| {
@@ -423,6 +439,7 @@ impl SceneDiagnosis {
             lamp: lamp.ok(),
             // A lamp's light falls as well.
             falloff: falloff.filter(|_| !is_lamp),
+            bands: None,
         }
     }
 }

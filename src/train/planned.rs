@@ -100,8 +100,9 @@ impl RequestedSettings {
             _ => diagnosed(&config),
         };
         if let PlanSource::File(file) = planning {
-            let planned = Some(Plan::read(file)?.falloff).filter(|planned| planned.on);
-            options.falloff = options.falloff.or(planned.map(|planned| planned.falloff));
+            let Plan { falloff, bands, .. } = Plan::read(file)?;
+            options.falloff = options.falloff.or(falloff.on.then_some(falloff.falloff));
+            options.bands = options.bands.or(bands.on.then_some(bands.rows));
         }
         let (mut dataset, plan) = if planning == PlanSource::Diagnosis {
             let (dataset, diagnosis) = Diagnosis::load(&config.dataset, &options)?;

@@ -177,6 +177,7 @@ mod tests {
             "extent=2",
             "light=linear",
             "falloff=1",
+            "bands={}",
             "schedule.first_sh_degree=1",
         ];
         set.extend(rest.map(str::to_owned));

@@ -277,7 +277,8 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     scene.gain = exposure.as_ref().map(|exposure| exposure.gain);
     let with_reference = settings.knows_references();
     let near_white = scene.after.near_white_fraction - scene.before.near_white_fraction;
-    let mut remarks = findings(&set.measured, exposure.as_ref(), near_white);
+    let measured: Vec<MeasuredPhotograph> = set.measured.into_values().collect();
+    let mut remarks = findings(&measured, exposure.as_ref(), near_white);
     if Dataset::is_at(&args.input) {
         remarks.extend(remarks_at_points(&TrainConfig { dataset: args.input.clone(), ..config }));
     }
@@ -295,8 +296,8 @@ struct CurveOnSet {
     inverted: bool,
     /// Counts of converted and unsupported colours, of photographs and of references.
     colours: [ColourCounts; 2],
-    /// Those that are not for tests, as they were mapped.
-    measured: Vec<MeasuredPhotograph>,
+    /// Those that are not for tests, by file: all where the curve depends on the whole set, else as they are mapped.
+    measured: BTreeMap<PathBuf, MeasuredPhotograph>,
 }
 
 impl CurveOnSet {
@@ -308,13 +309,14 @@ impl CurveOnSet {
         (input, inverted): (&Path, bool),
     ) -> Result<Self> {
         let levels = photographs.first().map(|listed| listed.levels).unwrap_or_default();
-        let mut measured = vec![];
+        let mut measured = BTreeMap::new();
         if settings.scene_statistics || settings.takes_exposure() {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
                 // Unusable photographs are reported when they are mapped.
                 let unsaid = ColourCounts::of_levels(levels);
                 let Ok((photograph, gaps)) = loaded(listed, inverted, &unsaid) else { continue };
-                measured.push(MeasuredPhotograph::measure(&without(&photograph, &gaps)));
+                let one = MeasuredPhotograph::measure(&without(&photograph, &gaps));
+                measured.insert(listed.input.clone(), one);
             }
             if measured.is_empty() && settings.scene_statistics {
                 let problem =
@@ -322,16 +324,17 @@ impl CurveOnSet {
                 return Err(Error::Usage(problem.to_owned()));
             }
         }
-        let scene = match SceneTone::from_photographs(&settings, &measured) {
+        let photographs: Vec<MeasuredPhotograph> = measured.values().cloned().collect();
+        let scene = match SceneTone::from_photographs(&settings, &photographs) {
             Some(scene) => scene,
-            None if measured.is_empty() => SceneTone::new(&settings),
+            None if photographs.is_empty() => SceneTone::new(&settings),
             None => return Err(all_black(input)),
         };
         Ok(Self {
             targets: Targets::in_scene(gpu, scene)?,
             inverted,
             colours: [ColourCounts::of_levels(levels), ColourCounts::new("reference image")],
-            measured: vec![],
+            measured,
         })
     }
 
@@ -340,14 +343,16 @@ impl CurveOnSet {
         &mut self,
         photograph: &Image,
         gaps: &[usize],
-        is_test: bool,
+        listed: &InputPhotograph,
     ) -> Result<(Statistics, Image, Option<f64>)> {
-        let measured = MeasuredPhotograph::measure(&without(photograph, gaps));
+        let known = self.measured.get(&listed.input).cloned();
+        let measured =
+            known.unwrap_or_else(|| MeasuredPhotograph::measure(&without(photograph, gaps)));
         let image = self.targets.tone_mapped(photograph, &measured)?;
         let gain = self.targets.scene.mapping_of(&measured).gain;
         let statistics = measured.statistics;
-        if !is_test {
-            self.measured.push(measured);
+        if listed.split != Some(Split::Test) {
+            self.measured.insert(listed.input.clone(), measured);
         }
         Ok((statistics, image, gain))
     }
@@ -386,8 +391,7 @@ fn mapped(set: &mut CurveOnSet, listed: &InputPhotograph) -> Result<Mapped> {
         Ok(if is_plain { Orientation::from_file(path).upright(image) } else { image })
     };
     let reference = listed.reference.as_ref().map(load).transpose()?;
-    let (statistics, image, gain) =
-        set.result(&photograph, &gaps, listed.split == Some(Split::Test))?;
+    let (statistics, image, gain) = set.result(&photograph, &gaps, listed)?;
     Ok(Mapped { photograph, gaps, statistics, image, gain, reference })
 }
 

@@ -7,6 +7,7 @@ use nightsplat_core::settings::Rule;
 use nightsplat_core::{Error, Result};
 
 use super::PixelOrientation;
+use super::shading::RowBands;
 use crate::image::{StoredLight, reduced_size};
 use crate::tree;
 use crate::white_balance::WhiteBalance;
@@ -53,6 +54,8 @@ pub struct LoadOptions {
     /// The fall-off of the lens: the light of the photographs is multiplied by exp(a u + b u^2), with u = 1 - cos of
     /// the angle off the axis.
     pub falloff: Option<[f64; 2]>,
+    /// Bands of rows of the photographs, which are evened out.
+    pub bands: Option<RowBands>,
     /// The size at which training photographs are measured while they are decoded, if they are not kept at that size.
     pub measured: MeasuredSize,
     /// Undistort photographs of a fisheye to a pinhole's, as for every other lens, instead of training with the fisheye
@@ -104,6 +107,7 @@ impl Default for LoadOptions {
             mask_overlays: true,
             white_balance: None,
             falloff: None,
+            bands: None,
             measured: MeasuredSize::default(),
             undistort: false,
             depth: DepthOptions::default(),

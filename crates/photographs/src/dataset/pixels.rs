@@ -19,6 +19,7 @@ use super::original::Original;
 use super::packed::Packed;
 use super::points;
 use super::prepare::{Preparation, check_size, disagreement, pixel_count};
+use super::shading::Shading;
 use super::source::{MAX_READ, ViewFiles};
 use super::tracked;
 use super::turns::{CameraPixels, ImageHeader, Turns};
@@ -424,9 +425,10 @@ impl ViewLoader<'_> {
                 None => format!("{name}: no pixel is a number that its mask shows"),
             });
         }
+        let shading = Shading::of(options, &name);
         let photograph = photograph
             .filter(|_| !is_hidden)
-            .map(|decoded| self.photograph(decoded, mask.as_ref(), split == Split::Train));
+            .map(|decoded| self.photograph(decoded, mask.as_ref(), shading, split == Split::Train));
         let (image, original) = photograph.transpose()?.unwrap_or_default();
         let reference =
             reference.filter(|_| !is_hidden).map(|decoded| self.reference_image(decoded));
@@ -483,20 +485,21 @@ impl ViewLoader<'_> {
         &self,
         decoded: DecodedPicture,
         mask: Option<&Mask>,
+        shading: Shading,
         is_training: bool,
     ) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
         let mut original = decoded.original(preparation.lens, options.undistort);
         let DecodedPicture { path, image, turns, is_light, .. } = decoded;
-        let whole = preparation.photograph(turns.loading.upright(image), &path, options.falloff)?;
+        let whole = preparation.photograph(turns.loading.upright(image), &path, shading)?;
         let whole = if is_light { preparation.shrunk_in_light(whole) } else { whole };
         let is_shrunk = preparation.size != (whole.width, whole.height);
         let is_kept = options.keep != Some(0);
         if is_kept && !is_shrunk {
             return Ok((Some(whole), None));
         }
-        (original.balance, original.falloff) = (loading.balance, options.falloff);
+        (original.balance, original.shading) = (loading.balance, shading);
         original.levels = loading.colours[0].levels();
         original.light_size = is_light.then_some(preparation.size);
         let measured = |image: &Image| match mask {

@@ -44,7 +44,8 @@ pub struct MeasuredPhotograph {
 impl MeasuredPhotograph {
     /// Measures the planes (3, pixels) of a photograph.
     pub fn measure(planes: &[f32]) -> Self {
-        let (statistics, luminance) = (Statistics::new(planes), LuminanceHistogram::new(planes));
+        let (luminance, luminances, sums) = LuminanceHistogram::counted(planes);
+        let statistics = Statistics::of_luminances(luminances, sums);
         Self { statistics, luminance, camera: None }
     }
 

@@ -84,7 +84,7 @@ impl TonePage {
         let mut pictures =
             vec![picture("photograph", None, photograph), picture(&self.curve, scores, image)];
         for (set, distribution) in &mut self.compared {
-            let (_, image, _) = set.result(photograph, gaps, true)?;
+            let (_, image, _) = set.result(photograph, gaps, listed)?;
             distribution.add(&without(&image, gaps));
             let scores = reference.as_ref().map(|reference| Scores::measure(&image, reference));
             pictures.push(picture(&distribution.name, scores.transpose()?, &image));

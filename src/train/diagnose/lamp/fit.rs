@@ -84,6 +84,12 @@ impl LampObservations {
         Ok(rows)
     }
 
+    /// With a column, of values in stops, taken from the brightness.
+    pub(in super::super) fn without(mut self, column: &[f64]) -> Self {
+        self.light.iter_mut().zip(column).for_each(|(light, value)| *light -= value);
+        self
+    }
+
     /// Refuses points whose distances from their cameras hardly differ.
     pub(super) fn check_distances(&self) -> Result<(), String> {
         let spread = trimmed_variance(self.less_point(self.distance.clone())).sqrt();
