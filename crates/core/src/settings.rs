@@ -215,6 +215,13 @@ pub fn row<'a>(rows: &'a [Setting], key: &str) -> Option<&'a Setting> {
     rows.iter().find(|row| row.key == key)
 }
 
+/// The Damerau-Levenshtein distance of two names minus the length of their common prefix, so that half a name is close
+/// to the whole.
+pub fn distance(from: &str, to: &str) -> i64 {
+    let alike = from.chars().zip(to.chars()).take_while(|(from, to)| from == to).count();
+    strsim::damerau_levenshtein(from, to) as i64 - alike as i64
+}
+
 /// Declares a struct of settings with its defaults, its rows and the check of its values.
 ///
 /// A field is `name: type = default => rule;`, and its documentation is its help. `default, "value in effect"` is for

@@ -123,8 +123,7 @@ fn table(output: &ToneOutput) -> NumberTable {
     let views = output.views.iter().map(|(name, report)| (name.clone(), *report));
     let rows = views.chain([("scene".to_owned(), output.scene)]).map(|(name, report)| {
         let before = report.before;
-        let mut values =
-            vec![Some(before.p10), Some(before.p90), Some(before.r), Some(report.delta0)];
+        let mut values = vec![Some(before.p10), Some(before.p90), Some(before.r), report.delta0];
         values.extend(measured(before));
         values.extend(measured(report.after));
         values.extend([
