@@ -1,4 +1,4 @@
-//! `nightsplat compare`: runs on one dataset, side by side.
+//! `nightsplat compare`: runs on one dataset, and renders of other programs, side by side.
 
 use std::path::PathBuf;
 
@@ -10,7 +10,7 @@ use super::eval::LpipsRange;
 use super::{finish, opener, print, word};
 use crate::Error;
 use crate::gpu::DeviceChoice;
-use crate::results::comparison::{CompareOptions, RunComparison};
+use crate::results::comparison::{CompareOptions, NamedRenders, RunComparison};
 
 /// Compare runs or models on the test views of one dataset.
 ///
@@ -21,8 +21,12 @@ use crate::results::comparison::{CompareOptions, RunComparison};
 #[command(after_help = EXAMPLES)]
 pub struct CompareArgs {
     /// Run directories, or models with --dataset; the first is the one that others are compared with
-    #[arg(required = true, num_args = 2..)]
+    #[arg(required = true)]
     pub runs: Vec<PathBuf>,
+    /// Renders of another program, scored as another row: a folder with a picture of every test view, of its size and
+    /// under its name; repeatable
+    #[arg(long, value_name = "NAME=DIR")]
+    pub renders: Vec<NamedRenders>,
     /// Write a page
     #[arg(long, value_name = "FILE.html")]
     pub report: Option<PathBuf>,
@@ -48,16 +52,18 @@ pub struct CompareArgs {
 
 const EXAMPLES: &str = "Examples:
   nightsplat compare run1 run2 --report compare.html
-  nightsplat compare run clean.ply --dataset photos       a run and its edited model";
+  nightsplat compare run clean.ply --dataset photos       a run and its edited model
+  nightsplat compare run --renders gsplat=other/renders   a run and the renders of another program";
 
 /// Compares the runs.
 pub fn run(args: &CompareArgs) -> Result<()> {
-    if args.runs.len() < 2 {
-        let problem = "compare takes two runs or more";
+    if args.runs.len() + args.renders.len() < 2 {
+        let problem = "compare takes two or more: <RUNS>..., or a run and --renders NAME=DIR";
         return Err(Error::Usage(problem.to_owned()).into());
     }
     args.report.iter().try_for_each(|path| check_writable(path))?;
     let options = CompareOptions {
+        renders: &args.renders,
         dataset: args.dataset.as_deref(),
         opener: opener(args.device.as_ref()),
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),

@@ -30,7 +30,7 @@ use crate::results::edit::{EditList, EditScore, Editor};
 pub struct EditArgs {
     /// Run directory, or a model: PLY, SPZ or SOG
     pub model: PathBuf,
-    /// Model to write or replace: .ply, .spz, .glb or .sog
+    /// Model to write or replace: .ply, .spz, .glb, .usda, .usdz or .sog
     #[arg(long, value_name = "MODEL")]
     pub out: PathBuf,
     #[command(flatten)]

@@ -40,6 +40,10 @@ pub struct EvalArgs {
     /// Score at 1/F of the size of the photographs, for a model that was trained at another [default: the run's]
     #[arg(long, value_name = "F")]
     pub downscale: Option<f64>,
+    /// Score the renders of another program in place of the run's: a folder with a picture of every test view, of its
+    /// size and under its name
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["photographs", "save_images"])]
+    pub renders: Option<PathBuf>,
     /// Add the scores after the least-squares gain and bias of each channel of each view, which use the reference
     #[arg(long)]
     pub align: bool,
@@ -103,6 +107,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         dataset: args.dataset.as_deref(),
         reference: args.reference.as_deref(),
         downscale: args.downscale,
+        renders: args.renders.as_deref(),
         opener: opener(args.device.as_ref()),
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),
         uniform_ssim: args.uniform_ssim,

@@ -46,6 +46,8 @@ pub enum ReferenceKind {
     References,
     /// The photographs of the test views, tone-mapped with the run's curve.
     PseudoGt,
+    /// Targets of the test views that another program made.
+    ExternalTargets,
     /// The photographs of the test views: without a curve, they are the targets.
     Photographs,
     /// The views in the light of the lamp at the camera, of a dataset that has them.
@@ -61,6 +63,10 @@ impl ReferenceKind {
                 "against their own pseudo-GT, as there are no reference images: how well the model reproduces its \
                  targets, not how right these are; runs of different curves do not compare",
             ),
+            Self::ExternalTargets => Some(
+                "against the targets of another program, as there are no reference images: how well the model \
+                 reproduces them, not how right these are; they compare with no other targets",
+            ),
             Self::Photographs => Some(
                 "against the photographs themselves, as there are no reference images and no curve",
             ),
@@ -73,6 +79,7 @@ impl ReferenceKind {
         match self {
             Self::References => "reference images",
             Self::PseudoGt => "pseudo-GT",
+            Self::ExternalTargets => "targets of another program",
             Self::Photographs => "photographs",
             Self::LitByLamp => "images in the light of the lamp",
         }
@@ -118,6 +125,8 @@ impl ScoreReference {
         let has_photographs = dataset.test_views().any(View::has_photograph);
         if has_references || !has_photographs {
             ReferenceKind::References
+        } else if tone.targets().is_some() {
+            ReferenceKind::ExternalTargets
         } else if tone.curve == ToneCurve::None {
             ReferenceKind::Photographs
         } else {

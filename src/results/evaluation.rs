@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::csv;
-use nightsplat_photographs::dataset::View;
+use nightsplat_photographs::dataset::{View, ViewPictures};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::metrics::Scores;
 use nightsplat_photographs::scene_tone::SceneTone;
@@ -17,7 +17,7 @@ use super::report::{Chart, Comparison, Picture, Report, Series};
 use super::{run, verdict};
 use crate::Result;
 use crate::networks::lpips::{Lpips, Range};
-use crate::train::{TrainConfig, known_stops};
+use crate::train::{Rendered, TrainConfig, known_stops};
 
 /// Maximum width of an image, pixels.
 const PICTURE_WIDTH: u32 = 480;
@@ -35,6 +35,8 @@ pub(crate) struct EvalOptions<'a> {
     pub(crate) dataset: Option<&'a Path>,
     pub(crate) reference: Option<&'a Path>,
     pub(crate) downscale: Option<f64>,
+    /// Renders of another program that are scored in place of those of the model.
+    pub(crate) renders: Option<&'a Path>,
     pub(crate) opener: Opener,
     /// The weights and the input range of LPIPS.
     pub(crate) lpips: Option<(&'a Path, Range)>,
@@ -54,8 +56,10 @@ pub(crate) struct EvalOptions<'a> {
 #[derive(Debug)]
 pub(crate) struct RunEvaluation {
     run: PathBuf,
+    /// The renders of another program, if these are scored.
+    renders: Option<PathBuf>,
     config: TrainConfig,
-    gaussians: usize,
+    gaussians: Option<usize>,
     pub(crate) evaluation: Evaluation,
     /// Images of the views with the lowest PSNR, the lowest first.
     worst: Vec<(f64, Comparison)>,
@@ -93,10 +97,15 @@ impl RunEvaluation {
         }
         let (count, mut index) = (reference.view_count(&dataset), 0);
         let is_even = reference.is_evenly_lit(&dataset);
+        let pictures = options.renders.map(|folder| ViewPictures::of_tests(folder, &dataset));
+        let pictures = pictures.transpose()?;
         let render = |view: &View| {
             begin(index, count, &view.name);
             index += 1;
-            model_renderer.render_as(view, is_even)
+            match &pictures {
+                Some(pictures) => pictures.load(view).map(Rendered::from),
+                None => model_renderer.render_as(view, is_even),
+            }
         };
         let mut worst = vec![];
         let keep = |images: &ScoredImages<'_>| {
@@ -109,22 +118,33 @@ impl RunEvaluation {
             Ok(())
         };
         let mut evaluation = Evaluation::new(&mut reference, &dataset, &extras, render, keep)?;
-        if lamp.is_some() {
+        if lamp.is_some() && pictures.is_none() {
             evaluation.add_lit(&dataset, |view| model_renderer.render(view))?;
         }
-        let render = |view: &View| model_renderer.render(view);
-        eval::warn_of_holes(&evaluation, &dataset, config.background, render)?;
+        if pictures.is_none() {
+            let render = |view: &View| model_renderer.render(view);
+            eval::warn_of_holes(&evaluation, &dataset, config.background, render)?;
+        }
         if evaluation.scores.is_empty() {
             let root = dataset.root.display();
             tracing::warn!(
                 "{root}: no test view has a reference image or a photograph: nothing to score"
             );
         }
-        Ok(Self { run: run.to_owned(), config, gaussians: gaussian_count, evaluation, worst })
+        let renders = options.renders.map(Path::to_owned);
+        let gaussians = Some(gaussian_count).filter(|_| renders.is_none());
+        Ok(Self { run: run.to_owned(), renders, config, gaussians, evaluation, worst })
     }
 
     /// The scores with what `metrics.json` of the run records besides.
     pub(crate) fn json(&self) -> Value {
+        if let Some(renders) = &self.renders {
+            let mut metrics = self.evaluation.json(None, None, None);
+            metrics["renders"] = serde_json::json!(renders);
+            eval::add_reference(&mut metrics, &self.config.tone);
+            self.evaluation.add_other_steps(&mut metrics, false);
+            return metrics;
+        }
         let recorded = run::load_metrics(&self.run);
         let steps = recorded["steps"].as_u64().or_else(|| run::stopped_at(&self.run));
         let steps = steps.or(Some(self.config.steps)).filter(|_| !is_model(&self.run));
@@ -176,11 +196,15 @@ impl RunEvaluation {
         let lpips = lpips.map(|(measure, mean)| format!("{}: {mean:.4}.", measure.title()));
         let shown = format!("Images of {} views, the worst first.", comparisons.len());
         let against = evaluation.label().map(|label| format!("Scores are {label}."));
+        let (subject, charts) = match &self.renders {
+            Some(renders) => (renders, vec![]),
+            None => (&self.run, history(&self.run)),
+        };
         Report {
-            title: format!("Evaluation of {}", self.run.display()),
+            title: format!("Evaluation of {}", subject.display()),
             intro: verdict.into_iter().chain(lpips).chain(against).chain([shown]).collect(),
             tables: vec![evaluation.table()],
-            charts: history(&self.run),
+            charts,
             comparisons,
             ..Report::default()
         }

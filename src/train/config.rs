@@ -333,6 +333,7 @@ impl TrainConfig {
             images: self.images.clone(),
             orientation: self.orientation,
             reference: self.reference.clone(),
+            targets: self.tone.targets().map(Path::to_owned),
             invert_masks: self.invert_masks,
             mask_borders: self.mask_borders,
             light: self.light,

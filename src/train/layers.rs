@@ -3,13 +3,14 @@
 //! Each is a [`SettingsLayer`]: keys of config.toml with values. [`Settings`] merges them and keeps the origin of every
 //! value.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::input;
 use nightsplat_core::settings::{Rule, Setting};
-use nightsplat_photographs::tone::{OF_CURVE, ToneCurve};
+use nightsplat_photographs::tone::{OF_CURVE, Tone, ToneCurve};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
@@ -111,6 +112,10 @@ impl SettingsLayer {
         let is_part = key.strip_prefix("tone.constants.").is_some_and(|name| !name.contains('.'));
         match setting(key) {
             Some(row) if takes(&row.rule, &value) => {}
+            // The nearest name, or what is wrong with a formula.
+            Some(Setting { key: Cow::Borrowed("tone.curve"), .. }) if value.is_str() => {
+                value.as_str().unwrap_or_default().parse::<Tone>()?;
+            }
             Some(row) => return Err(row.refused(value)),
             None if is_part && number(&value).is_some_and(f64::is_finite) => {}
             None => return Err(unknown(key)),
@@ -190,7 +195,7 @@ impl Settings {
         let constants = curve.map_or(&[][..], |curve: ToneCurve| curve.family().constants);
         constants
             .iter()
-            .map(|constant| (constant.name.to_owned(), constant.default.into()))
+            .map(|constant| (constant.name.to_string(), constant.default.into()))
             .collect()
     }
 

@@ -6,11 +6,12 @@ use nightsplat_photographs::dataset::{Dataset, LoadOptions};
 use toml::Value;
 
 use super::config::TrainConfig;
-use super::diagnose::{Diagnosis, Plan};
+use super::diagnose::{Diagnosis, Plan, PlannedPart};
 use super::layers::{Origin, Settings, SettingsLayer};
 use super::preset::Preset;
 use super::trainer::Trainer;
 use crate::gpu::Gpu;
+use crate::targets::external::ExternalTargets;
 use crate::{Error, Result};
 
 /// Requested settings of a run in addition to its plan, from the lowest precedence to the highest.
@@ -110,10 +111,20 @@ impl RequestedSettings {
         } else {
             (Dataset::load(&config.dataset, &options)?, None)
         };
-        let plan = match planning {
+        let mut plan = match planning {
             PlanSource::File(file) => Some(Plan::load(file, &dataset)?),
             _ => plan,
         };
+        if let Some(folder) = config.tone.targets() {
+            let found = ExternalTargets::check(folder, &dataset)?;
+            match &mut plan {
+                Some(plan) => plan.curve = PlannedPart { on: false, why: found.sentence() },
+                None => tracing::info!("{}", found.sentence()),
+            }
+            if let Some(problem) = found.problem() {
+                tracing::warn!("{}: {problem}", folder.display());
+            }
+        }
         if let Some(plan) = &plan {
             dataset.leave_out(&plan.left_out);
         }

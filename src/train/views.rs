@@ -106,6 +106,7 @@ impl Views {
             let whole = if is_larger.is_some() { view.photograph()? } else { None };
             let whole =
                 whole.map(|whole| pseudo_gt.tone_mapped(&whole, &tone_mapping)).transpose()?;
+            let whole = targets.external(view)?.or(whole);
             for (views, size) in levels.iter_mut().zip(sizes) {
                 let resized = |whole: &Image| view.blacked_out(whole.resized(size.x, size.y));
                 let camera = frame.camera(&view.camera).resized(size.x, size.y);

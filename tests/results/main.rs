@@ -15,6 +15,7 @@ mod injected;
 mod light;
 mod lost_work;
 mod model_files;
+mod other_programs;
 mod profile;
 mod rendered;
 mod report;

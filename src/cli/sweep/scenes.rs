@@ -36,6 +36,7 @@ pub(super) fn run(args: &SweepArgs) -> Result<()> {
             dataset: dataset.clone(),
             more: vec![],
             out: args.out.join(&name),
+            renders: args.renders.iter().map(|renders| renders.of_scene(&name)).collect(),
             ..args.clone()
         };
         let title = format!("Sweep of {name}");

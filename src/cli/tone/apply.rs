@@ -13,8 +13,8 @@ use nightsplat_photographs::image::{ColourCounts, Image, Mask, Orientation, Pict
 use nightsplat_photographs::metrics::Scores;
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{
-    CurveChoice, Exposure, MeasuredPhotograph, NEAR_WHITE, Statistics, Tone, ToneCurve,
-    ToneSettings, all_black,
+    CurveChoice, Exposure, MeasuredPhotograph, NEAR_WHITE, Statistics, Tone, ToneSettings,
+    all_black,
 };
 use nightsplat_photographs::tree::check_writable;
 use serde::Serialize;
@@ -23,7 +23,7 @@ use self::page::TonePage;
 use self::photographs::{InputPhotograph, listed};
 use crate::cli::settings::{CurveOptions, Selection, SettingOptions};
 use crate::cli::tell::wrapped;
-use crate::cli::{OutputFormat, finish, print, progress_bar, word, words};
+use crate::cli::{OutputFormat, finish, print, progress_bar, quoted, word, words};
 use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
@@ -128,8 +128,9 @@ pub struct ToneReport {
     /// The photograph.
     #[serde(flatten)]
     pub before: Measures,
-    /// Black level by the curve's alpha and beta, or by the paper's alpha if the curve has none.
-    pub delta0: f64,
+    /// Black level by the alpha and beta of the curve, if it has one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub delta0: Option<f64>,
     /// Pixels that are masked, or not finite and thus black in the result; no statistic includes them.
     pub unusable_pixels: usize,
     /// The result.
@@ -208,7 +209,8 @@ pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
         .collect();
     let next = match Dataset::is_at(&args.input) {
         true => {
-            format!("nightsplat train {} --out run --curve {}", word(&args.input), args.tone.name())
+            let curve = quoted(&args.tone.name());
+            format!("nightsplat train {} --out run --curve {curve}", word(&args.input))
         }
         false => format!("nightsplat pose {} --out scene", word(&args.input)),
     };
@@ -413,12 +415,9 @@ impl Mapped {
             }
             Scores::of_counted(image, reference, Mask::hiding(image, gaps).as_ref())
         });
-        let paper = ToneSettings::new(ToneCurve::Ap3);
-        let alpha = if settings.alpha > 0.0 { settings.alpha } else { paper.alpha };
-        let black_level = ToneSettings { alpha, ..settings.clone() };
         Ok(ToneReport {
             before: Measures::new(&usable, statistics),
-            delta0: black_level.offset(statistics.printed_ratio()),
+            delta0: settings.has_black_level().then(|| settings.offset(statistics.printed_ratio())),
             unusable_pixels: gaps.len(),
             after: Measures::new(&result, &Statistics::new(&result)),
             gain: *gain,
@@ -455,7 +454,11 @@ fn scene(views: &[(&InputPhotograph, ToneReport)]) -> Option<ToneReport> {
     let scores: Vec<Scores> = test.iter().filter_map(|report| report.scores).collect();
     (!views.is_empty()).then(|| ToneReport {
         before: measures(|report| report.before),
-        delta0: training.iter().map(|report| report.delta0).sum::<f64>() / training.len() as f64,
+        delta0: training
+            .iter()
+            .map(|report| report.delta0)
+            .sum::<Option<f64>>()
+            .map(|sum| sum / training.len() as f64),
         unusable_pixels: views.iter().map(|(_, report)| report.unusable_pixels).sum(),
         after: measures(|report| report.after),
         gain: None,

@@ -17,8 +17,8 @@ use crate::{Error, Result};
 /// List the tone curves, print their values or plot them.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ListArgs {
-    /// Names, or .toml, .csv and .cube files [default: all]
-    #[arg(value_name = "NAME|FILE", value_parser = words::curves::<CurveChoice>())]
+    /// Names, formulas, or .toml, .csv and .cube files [default: all]
+    #[arg(value_name = "NAME|FORMULA|FILE", value_parser = words::curves::<CurveChoice>())]
     pub curves: Vec<CurveChoice>,
     /// Plot the curves as SVG
     #[arg(long, value_name = "FILE.svg")]
@@ -106,9 +106,11 @@ fn listing(curves: &[NamedCurve]) -> String {
     for NamedCurve { name, settings } in curves {
         let what = match &settings.curve {
             Tone::Formula(_) => "",
+            Tone::Expression(_) => "a formula of your own, evaluated into a table of values",
             Tone::Auto => AUTO,
             Tone::Table(_) => "a table of values, monotone cubics between them",
             Tone::Profile(_) => "a camera profile: matrix, gain, bias and segments of each channel",
+            Tone::External(_) => "no curve: the targets are made by another program",
         };
         let Some(family) = settings.curve.family() else {
             text += &format!("{name}\n    {what}\n");

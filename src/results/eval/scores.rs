@@ -180,7 +180,12 @@ impl Evaluation {
     }
 
     /// `metrics.json`: means, views, and the resources of the run; unknown values are null.
-    pub(crate) fn json(&self, seconds: Option<f64>, gaussians: usize, steps: Option<u64>) -> Value {
+    pub(crate) fn json(
+        &self,
+        seconds: Option<f64>,
+        gaussians: Option<usize>,
+        steps: Option<u64>,
+    ) -> Value {
         let entry = |view: Option<&str>| {
             let mut entry = self.entry(view, After::Model, &Metric::OF_MODEL);
             let before_denoiser = self.entry(view, After::Gaussians, &Metric::OF_IMAGES);
@@ -305,6 +310,9 @@ impl Evaluation {
 /// Key in `metrics.json` for what the scores are against, unless it is reference images.
 pub(crate) const AGAINST: &str = "against";
 
+/// Key in `metrics.json` for targets that another program made.
+const TARGETS: &str = "targets";
+
 /// Key in `metrics.json` for what the targets take from reference images, if anything.
 pub(crate) const WITH_REFERENCE: &str = "with_reference";
 
@@ -315,8 +323,12 @@ pub(crate) fn with_reference(settings: &str) -> String {
     )
 }
 
-/// Adds [`WITH_REFERENCE`] to `metrics.json` if the targets depend on reference images.
+/// Adds [`WITH_REFERENCE`] to `metrics.json` if the targets depend on reference images, and their origin if another
+/// program made them.
 pub(crate) fn add_reference(metrics: &mut Value, tone: &ToneSettings) {
+    if tone.targets().is_some() {
+        metrics[TARGETS] = json!(tone.curve.to_string());
+    }
     if let Some(settings) = tone.knows_references() {
         metrics[WITH_REFERENCE] = json!(settings);
     }

@@ -114,7 +114,7 @@ pub fn train_in(
     let (ended, evaluation, spent) = finished
         .inspect_err(|error| train_loop.save_on_error(error, &mut trainer, &mut directory))?;
     let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
-    let mut metrics = evaluation.json(Some(spent.seconds), gaussians, Some(steps));
+    let mut metrics = evaluation.json(Some(spent.seconds), Some(gaussians), Some(steps));
     metrics[SPENT] = serde_json::json!(spent);
     eval::add_reference(&mut metrics, &config.tone);
     if let Some(exposure) = trainer.scene().target_exposure(dataset) {

@@ -145,7 +145,11 @@ impl Leaderboard<'_> {
             let metrics = run.metrics().unwrap_or_default();
             let score = |name: &str| metrics["views"][&view.name][name].as_f64();
             let scores = scored(score("psnr"), score("ssim"));
-            pictures.push(picture(&self.rows.label(row, None), scores, &run.render(gpu, view)?));
+            pictures.push(picture(
+                &self.rows.label(row, None),
+                scores,
+                &run.render(gpu, dataset, view)?,
+            ));
             if pictures.len() > 1 + MAX_PICTURES {
                 break;
             }

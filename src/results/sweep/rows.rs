@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use super::point::{PARTS, PRESET, SEED, SweepPoint};
+use super::point::{PARTS, PRESET, RENDERS, SEED, SweepPoint};
 use super::run::SweepRun;
 use crate::results::eval::{AGAINST, WITH_REFERENCE};
 use crate::results::run::{Progress, load_progress};
@@ -83,7 +83,8 @@ impl SweepResults {
     /// The settings of a row as a label, without the axis `except`.
     pub fn label(&self, row: &SweepRow, except: Option<&str>) -> String {
         let speaks = |key: &str| {
-            ["curve", PRESET, PARTS].contains(&key) || (except.is_none() && self.keys.len() == 1)
+            ["curve", PRESET, PARTS, RENDERS].contains(&key)
+                || (except.is_none() && self.keys.len() == 1)
         };
         let word = |key: &String| {
             let value = row.point.value(key)?;

@@ -12,7 +12,7 @@ fn args(pairs: &[PathBuf]) -> FitArgs {
     FitArgs {
         pairs: pairs.to_vec(),
         normal: None,
-        family: FamilyChoice::One(ToneCurve::Reinhard),
+        family: FamilyChoice::One(ToneCurve::Reinhard.into()),
         out: None,
         channels: ChannelChoice::Rgb,
         weigh: WeightingChoice::Pixels,
@@ -109,7 +109,7 @@ fn pairs_that_cannot_be_used_are_named_in_one_line() {
         1,
     );
     fails(
-        FitArgs { family: FamilyChoice::One(ToneCurve::None), ..args(&[path("good")]) },
+        FitArgs { family: FamilyChoice::One(ToneCurve::None.into()), ..args(&[path("good")]) },
         "no constants",
         2,
     );

@@ -37,6 +37,8 @@ pub struct LoadOptions {
     pub orientation: PixelOrientation,
     /// A folder of reference images by name, in place of what is found beside the input.
     pub reference: Option<PathBuf>,
+    /// A folder of targets by name, which another program made of the photographs.
+    pub targets: Option<PathBuf>,
     /// Whether test views also load their dark photograph, if any.
     pub load_low_test: bool,
     /// Number of training views, at most an eighth, that are held out to detect convergence.
@@ -99,6 +101,7 @@ impl Default for LoadOptions {
             images: None,
             orientation: PixelOrientation::Auto,
             reference: None,
+            targets: None,
             load_low_test: true,
             hold_out: 0,
             invert_masks: false,
@@ -162,6 +165,7 @@ impl LoadOptions {
         let folders = [
             (&self.images, "photographs"),
             (&self.reference, "reference images"),
+            (&self.targets, "targets"),
             (&self.depth.folder, "depth maps"),
         ];
         for (folder, of) in folders {

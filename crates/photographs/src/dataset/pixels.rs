@@ -26,7 +26,7 @@ use super::turns::{CameraPixels, ImageHeader, Turns};
 use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::image::decoded_at_once;
-use crate::image::{ColourCounts, Image, Levels, Mask, MaskFile, PictureFile};
+use crate::image::{ColourCounts, Image, Levels, Mask, MaskFile, Orientation, PictureFile};
 use crate::tone::MeasuredPhotograph;
 use crate::white_balance::WhiteBalanceMatrix;
 
@@ -371,10 +371,12 @@ impl ViewLoader<'_> {
             view_from_world,
             input,
             reference,
+            target,
             mask: mask_file,
             depth,
             read,
             turns,
+            size,
             ..
         } = source;
         let (options, [read, read_reference]) = (loading.options, read);
@@ -433,6 +435,7 @@ impl ViewLoader<'_> {
         let reference =
             reference.filter(|_| !is_hidden).map(|decoded| self.reference_image(decoded));
         let (reference, reference_file) = reference.transpose()?.unwrap_or_default();
+        let target_file = target.map(|path| self.target(path, turns[0], size)).transpose()?;
         let unused = |problem| tracing::warn!("the depth of view {name} is not used: {problem}");
         let depth = depth.and_then(|path| {
             depth_map(&path, preparation, options.depth.is_disparity).map_err(unused).ok()
@@ -441,6 +444,7 @@ impl ViewLoader<'_> {
         let unit = colours.levels().unit();
         let view =
             View { orientation, original, unit, reference, reference_file, mask, depth, ..view };
+        let view = View { target_file, ..view };
         let view = (split == Split::Test || view.has_photograph()).then_some(view);
         Ok(LoadedView { name, view, problems, brightness, reference: reference_original })
     }
@@ -527,6 +531,28 @@ impl ViewLoader<'_> {
         hasher.write(bytemuck::cast_slice(&image.data));
         original.checksum = Some(hasher);
         Ok((None, Some(original)))
+    }
+
+    /// The file of a target, which has the size of its photograph, as it is stored or turned as the camera took it.
+    fn target(&self, path: PathBuf, turns: Turns, taken: (u32, u32)) -> Result<Original> {
+        let size = PictureFile::open(&path)?.size()?;
+        let Preparation { lens, size: loaded, .. } = self.preparation;
+        let sizes = [taken, (lens.width, lens.height), loaded];
+        let loading = match [turns.loading, Orientation::UPRIGHT, turns.viewing.inverse()]
+            .into_iter()
+            .find(|turn| sizes.contains(&turn.size(size)))
+        {
+            Some(loading) => loading,
+            None => {
+                let ([width, height], [w, h]) = (<[u32; 2]>::from(size), <[u32; 2]>::from(taken));
+                let problem = format!(
+                    "is {width}x{height}, its photograph {w}x{h}; targets have the size of their photographs"
+                );
+                return Err(Error::input(path, problem));
+            }
+        };
+        let undistort = self.loading.options.undistort;
+        Ok(Original::new(path, *lens, undistort, Turns { loading, ..turns }))
     }
 
     fn reference_image(&self, decoded: DecodedPicture) -> Result<InMemory> {

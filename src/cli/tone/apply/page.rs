@@ -140,14 +140,14 @@ pub(super) fn table(output: &ToneOutput) -> NumberTable {
         [Some(mean_luminance), Some(skewness), Some(100.0 * near_white_fraction)]
     };
     // The black level of the curve auto does not depend on the photograph.
-    let has_black_level = output.curve.alpha > 0.0 && output.curve.curve != Tone::Auto;
+    let has_black_level = output.curve.has_black_level() && output.curve.curve != Tone::Auto;
     let mut views: Vec<(&str, &ToneReport)> =
         output.views.iter().map(|(name, report)| (name.as_str(), report)).collect();
     views.sort_by(|a, b| natural::compare(a.0, b.0));
     let rows = views.into_iter().chain([("scene", &output.scene)]).map(|(name, report)| {
         let ToneReport { before, delta0, after, gain, scores, .. } = report;
         let of_black_level =
-            [before.r, *delta0].map(|value| Some(value).filter(|_| has_black_level));
+            [Some(before.r), *delta0].map(|value| value.filter(|_| has_black_level));
         let mut values = vec![Some(before.p10), Some(before.p90)];
         values.extend(of_black_level);
         values.push(*gain);
