@@ -99,7 +99,8 @@ pub fn run(args: &MakeArgs, everything: bool) -> Result<()> {
         stop_between(&made, &requests)?;
     }
     display.begin(Stage::Training);
-    train::train(&training(args, &made, display.prefix(Stage::Training)), Some(&requests))?;
+    let training = training(args, &made, display.prefix(Stage::Training));
+    train::train(&training, everything, Some(&requests))?;
     let page = page(args, &made)?;
     display.end(&page, open_page(&page, args.no_open));
     Ok(())

@@ -60,7 +60,9 @@ fn light(scene: &SceneDiagnosis) -> String {
 fn grades(against: ReferenceKind) -> [[f64; 2]; 2] {
     match against {
         ReferenceKind::References | ReferenceKind::LitByLamp => [[20.0, 0.75], [16.0, 0.55]],
-        ReferenceKind::PseudoGt | ReferenceKind::Photographs => [[26.0, 0.75], [21.0, 0.55]],
+        ReferenceKind::PseudoGt | ReferenceKind::ExternalTargets | ReferenceKind::Photographs => {
+            [[26.0, 0.75], [21.0, 0.55]]
+        }
     }
 }
 
@@ -89,6 +91,7 @@ pub(crate) fn of_model(evaluation: &Evaluation) -> Option<String> {
     let images = match against {
         ReferenceKind::References => "the reference images in normal light",
         ReferenceKind::PseudoGt => "their targets, the brightened photographs",
+        ReferenceKind::ExternalTargets => "their targets, which another program made",
         ReferenceKind::Photographs => "the photographs themselves",
         ReferenceKind::LitByLamp => "the images in the light of the lamp",
     };

@@ -419,7 +419,7 @@ mod tests {
     fn a_single_constant_of_a_curve_can_be_set() {
         let family = ToneCurve::ALL.into_iter().find(|curve| !curve.family().constants.is_empty());
         let curve = family.unwrap();
-        let name = curve.family().constants[0].name;
+        let name = &curve.family().constants[0].name;
         let config = with(&[
             &format!("tone.curve={}", curve.name()),
             &format!("tone.constants.{name}=0.75"),

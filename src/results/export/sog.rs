@@ -437,9 +437,10 @@ mod tests {
                 antialiased: true,
                 linear: None,
                 law: SceneLaw::parse("auto 4.25 0.0125 0.075 1 1 0.333"),
+                targets: Some(r#"{"curve":"auto"}"#.to_owned()),
                 origin: model.origin,
             };
-            let provenance = Provenance { facts, ..Provenance::default() };
+            let provenance = Provenance { facts: facts.clone(), ..Provenance::default() };
             let (back, stated) = decode(&encode(&model, &provenance).unwrap()).unwrap();
             assert_eq!((stated, back.origin, back.shape), (facts, model.origin, model.shape));
             let mut errors = [0.0_f32; 5];

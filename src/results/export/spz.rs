@@ -392,9 +392,10 @@ mod tests {
             antialiased: true,
             linear: None,
             law: SceneLaw::parse("auto 4.25 0.0125 0.075 1 1 0.333"),
+            targets: Some(r#"{"curve":"auto"}"#.to_owned()),
             origin: model.origin,
         };
-        let provenance = Provenance { facts, ..Provenance::default() };
+        let provenance = Provenance { facts: facts.clone(), ..Provenance::default() };
         for version in [Version::V3, Version::V4] {
             let file = encode(&model, &provenance, version).unwrap();
             if version == Version::V4 {
@@ -424,7 +425,7 @@ mod tests {
     #[test]
     fn a_truncated_or_edited_file_is_an_error_and_not_a_panic() {
         let facts = ModelFacts { near: Some(0.1), ..ModelFacts::default() };
-        let provenance = Provenance { facts, ..Provenance::default() };
+        let provenance = Provenance { facts: facts.clone(), ..Provenance::default() };
         for version in [Version::V3, Version::V4] {
             let file = encode(&drawn(5, 1), &provenance, version).unwrap();
             // A file of version 4 ends with the text, which is optional.
