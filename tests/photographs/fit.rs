@@ -144,7 +144,7 @@ fn black_level_gain_and_target_mean_are_recovered_for_adaptive_curves() {
         };
         println!("{}: {:?}", family.name, found.constants);
         for constant in &found.constants {
-            let truth = expected(constant.name);
+            let truth = expected(&constant.name);
             let allowed = 5.0 * constant.standard_error.unwrap_or(0.0) + 0.03 * truth;
             let error = (constant.value - truth).abs();
             assert!(

@@ -402,7 +402,7 @@ mod tests {
                 assert_eq!(file[14], ANTIALIASED, "the flag that other readers know");
             }
             let (back, stated) = decode(&file).unwrap();
-            assert_eq!((stated, back.origin, back.shape), (facts, model.origin, model.shape));
+            assert_eq!((&stated, back.origin, back.shape), (&facts, model.origin, model.shape));
             let error = |values: &[f32], back: &[f32]| {
                 values.iter().zip(back).fold(0.0_f32, |most, (a, b)| most.max((a - b).abs()))
             };
