@@ -147,8 +147,8 @@ case $part in
         if [ -n "${LPIPS_VGG:-}" ]; then
             echo "by the protocol of RealX3D's authors: SSIM with a uniform window of 7x7, LPIPS by VGG-16"
             find "$out" -name metrics.json -printf '%h\n' | sort | while read -r run; do
-                scores=$(tool eval "$run" --json --uniform-ssim --lpips "$LPIPS_VGG")
-                python3 -c 'import json, sys; mean = json.loads(sys.argv[2])["mean"]; print(sys.argv[1], mean)' "${run#"$out/"}" "$scores"
+                echo "${run#"$out/"}"
+                tool eval "$run" --uniform-ssim --lpips "$LPIPS_VGG" | grep '^mean\|^view'
             done | tee "$out/authors.txt"
         fi
         ;;

@@ -13,9 +13,9 @@ use crate::error::usage;
 pub(crate) type Floats<'py> = Bound<'py, PyArrayDyn<f32>>;
 
 /// An image, from anything that numpy takes for an array (H, W, 3) of uint8, of uint16 or of floats from 0 to 1.
-pub(crate) struct Picture(pub(crate) Image);
+pub(crate) struct PyImage(pub(crate) Image);
 
-impl<'py> FromPyObject<'_, 'py> for Picture {
+impl<'py> FromPyObject<'_, 'py> for PyImage {
     type Error = PyErr;
 
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {

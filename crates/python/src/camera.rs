@@ -9,7 +9,7 @@ use crate::error::usage;
 
 /// A camera of Python.
 #[derive(FromPyObject)]
-pub(crate) struct Camera<'py> {
+pub(crate) struct PyCamera<'py> {
     view_from_world: Bound<'py, PyAny>,
     size: [u32; 2],
     focal: [f64; 2],
@@ -17,7 +17,7 @@ pub(crate) struct Camera<'py> {
     fisheye: Option<[f64; 4]>,
 }
 
-impl Camera<'_> {
+impl PyCamera<'_> {
     /// The library's camera; refused where the pose is not rigid or the lens cannot be used.
     pub(crate) fn checked(&self) -> PyResult<nightsplat::Camera> {
         let Self { view_from_world, size: [width, height], focal, principal_point, fisheye } = self;
@@ -49,7 +49,7 @@ impl Camera<'_> {
 
 /// Raises where a camera cannot be rendered.
 #[pyfunction]
-pub(crate) fn check_camera(camera: Camera<'_>) -> PyResult<()> {
+pub(crate) fn check_camera(camera: PyCamera<'_>) -> PyResult<()> {
     camera.checked().map(drop)
 }
 

@@ -14,11 +14,11 @@ use crate::photographs::config;
 use crate::{assignments, call};
 
 /// Photographs with their cameras.
-#[pyclass(frozen, module = "nightsplat")]
-pub(crate) struct Dataset(Arc<nightsplat::Dataset>);
+#[pyclass(frozen, name = "Dataset", module = "nightsplat")]
+pub(crate) struct PyDataset(Arc<nightsplat::Dataset>);
 
 #[pymethods]
-impl Dataset {
+impl PyDataset {
     /// Loads a folder with transforms*.json or a COLMAP model. Settings are keys of config.toml, such as `downscale=2`.
     #[staticmethod]
     #[pyo3(signature = (folder, **settings))]
@@ -34,21 +34,21 @@ impl Dataset {
 
     /// The views, sorted by name.
     #[getter]
-    fn views(&self) -> Vec<View> {
-        let view = |index| View { dataset: self.0.clone(), index };
+    fn views(&self) -> Vec<PyView> {
+        let view = |index| PyView { dataset: self.0.clone(), index };
         (0..self.0.views.len()).map(view).collect()
     }
 }
 
 /// A photograph's place in a dataset.
-#[pyclass(frozen, module = "nightsplat")]
-pub(crate) struct View {
+#[pyclass(frozen, name = "View", module = "nightsplat")]
+pub(crate) struct PyView {
     dataset: Arc<nightsplat::Dataset>,
     index: usize,
 }
 
 #[pymethods]
-impl View {
+impl PyView {
     /// The photograph's file name without extension.
     #[getter]
     fn name(&self) -> &str {
@@ -78,7 +78,7 @@ impl View {
     }
 }
 
-impl View {
+impl PyView {
     fn view(&self) -> &nightsplat::View {
         &self.dataset.views[self.index]
     }

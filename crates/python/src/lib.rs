@@ -23,13 +23,13 @@ mod _native {
     #[pymodule_export]
     use crate::{
         camera::check_camera,
-        dataset::{Dataset, View},
-        device::Device,
-        metrics::{Lpips, psnr, ssim},
-        model::Model,
+        dataset::{PyDataset, PyView},
+        device::PyDevice,
+        metrics::{PyLpips, psnr, ssim},
+        model::PyModel,
         photographs::{diagnose, load_image, save_image, synthetic_dataset, tone_map},
-        renderer::{Render, Renderer},
-        training::{Step, Training, train},
+        renderer::{PyRender, PyRenderer},
+        training::{PyStep, PyTraining, train},
     };
     use pyo3::prelude::*;
 

@@ -12,11 +12,11 @@ use crate::call;
 use crate::error::usage;
 
 /// Gaussians with what a renderer must know of them; `len` is their number.
-#[pyclass(frozen, module = "nightsplat")]
-pub(crate) struct Model(pub(crate) nightsplat::Model);
+#[pyclass(frozen, name = "Model", module = "nightsplat")]
+pub(crate) struct PyModel(pub(crate) nightsplat::Model);
 
 #[pymethods]
-impl Model {
+impl PyModel {
     /// Reads a model: PLY, SPZ, SOG, or a run directory.
     #[staticmethod]
     fn load(py: Python<'_>, path: PathBuf) -> PyResult<Self> {

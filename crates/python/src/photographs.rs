@@ -13,8 +13,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde::Serialize;
 
-use crate::arrays::{Floats, Picture, of_image};
-use crate::device::{Device, opened};
+use crate::arrays::{Floats, PyImage, of_image};
+use crate::device::{PyDevice, opened};
 use crate::error::{exception, usage};
 use crate::{assignments, call, objects};
 
@@ -26,7 +26,7 @@ pub(crate) fn load_image(py: Python<'_>, path: PathBuf) -> PyResult<Floats<'_>> 
 
 /// Writes an image, (H, W, 3), sRGB-encoded: .exr as floats of linear light, else a PNG of 8 bits.
 #[pyfunction]
-pub(crate) fn save_image(py: Python<'_>, path: PathBuf, array: Picture) -> PyResult<()> {
+pub(crate) fn save_image(py: Python<'_>, path: PathBuf, array: PyImage) -> PyResult<()> {
     call(py, || match path.extension() {
         Some(extension) if extension == "exr" => array.0.save_exr(path),
         _ => array.0.save_png8(path),
@@ -57,9 +57,9 @@ pub(crate) fn synthetic_dataset(
 #[pyo3(signature = (array, *, curve = "auto", device = None, **settings))]
 pub(crate) fn tone_map<'py>(
     py: Python<'py>,
-    array: Picture,
+    array: PyImage,
     curve: &str,
-    device: Option<&Bound<'py, Device>>,
+    device: Option<&Bound<'py, PyDevice>>,
     settings: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Floats<'py>> {
     let settings = assignments(py, settings)?.into_iter().chain([format!("curve={curve:?}")]);
@@ -101,7 +101,7 @@ pub(crate) fn diagnose<'py>(
     py: Python<'py>,
     dataset: PathBuf,
     preset: Option<&str>,
-    device: Option<&Bound<'py, Device>>,
+    device: Option<&Bound<'py, PyDevice>>,
     settings: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
     let config = config(dataset, preset, &assignments(py, settings)?)?;

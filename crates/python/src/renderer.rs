@@ -1,25 +1,25 @@
 //! Renders of a model.
 
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use nightsplat::TrainConfig;
 use nightsplat::config::TrainingFrame;
 use nightsplat::run::{ModelRenderer, RenderLayer, load_config, load_networks};
-use nightsplat::{Gpu, TrainConfig};
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
 
 use crate::arrays::{Floats, array, interleaved, of_image};
 use crate::call;
-use crate::camera::Camera;
-use crate::device::{Device, opened};
+use crate::camera::PyCamera;
+use crate::device::{PyDevice, opened};
 use crate::error::usage;
-use crate::model::Model;
+use crate::model::PyModel;
 
 /// The images of a camera, or of each camera of a batch of N: then every shape begins with N.
-#[pyclass(frozen, get_all, module = "nightsplat")]
-pub(crate) struct Render {
+#[pyclass(frozen, get_all, name = "Render", module = "nightsplat")]
+pub(crate) struct PyRender {
     /// (H, W, 3), float32: sRGB-encoded colours over black; white is 1, and values may exceed it.
     color: Py<PyArrayDyn<f32>>,
     /// (H, W), float32: the median depth in the view, world units; infinite where under half of the light is stopped.
@@ -29,33 +29,36 @@ pub(crate) struct Render {
 }
 
 /// A model on a device, ready to render.
-#[pyclass(frozen, module = "nightsplat")]
-pub(crate) struct Renderer {
+#[pyclass(frozen, name = "Renderer", module = "nightsplat")]
+pub(crate) struct PyRenderer {
     renderer: Mutex<ModelRenderer>,
-    _device: Arc<Gpu>,
 }
 
 #[pymethods]
-impl Renderer {
+impl PyRenderer {
     #[new]
     #[pyo3(signature = (model, device = None))]
     fn new(
         py: Python<'_>,
-        model: &Bound<'_, Model>,
-        device: Option<&Bound<'_, Device>>,
+        model: &Bound<'_, PyModel>,
+        device: Option<&Bound<'_, PyDevice>>,
     ) -> PyResult<Self> {
         let (device, model) = (opened(py, device)?, &model.get().0);
         // Positions keep their precision relative to the model's origin.
         let frame = TrainingFrame { center: model.gaussians.origin.into(), scale: 1.0 };
         let config = TrainConfig { frame: Some(frame), ..TrainConfig::default() };
         let renderer = call(py, || ModelRenderer::new(&device, model, &config, None))?;
-        Ok(Self { renderer: Mutex::new(renderer), _device: device })
+        Ok(Self { renderer: Mutex::new(renderer) })
     }
 
     /// The model of a run directory, with its networks, as `nightsplat render` shows it.
     #[staticmethod]
     #[pyo3(signature = (run, device = None))]
-    fn of_run(py: Python<'_>, run: PathBuf, device: Option<&Bound<'_, Device>>) -> PyResult<Self> {
+    fn of_run(
+        py: Python<'_>,
+        run: PathBuf,
+        device: Option<&Bound<'_, PyDevice>>,
+    ) -> PyResult<Self> {
         let device = opened(py, device)?;
         let renderer = call(py, || {
             let config = load_config(&run)?;
@@ -64,15 +67,15 @@ impl Renderer {
             let networks = load_networks(&device, &run, &config.model, features)?;
             ModelRenderer::new(&device, &model, &config, networks)
         })?;
-        Ok(Self { renderer: Mutex::new(renderer), _device: device })
+        Ok(Self { renderer: Mutex::new(renderer) })
     }
 
     /// Renders a camera in the model's world, or a batch: a list of cameras of one size.
-    fn render(&self, py: Python<'_>, camera: &Bound<'_, PyAny>) -> PyResult<Render> {
+    fn render(&self, py: Python<'_>, camera: &Bound<'_, PyAny>) -> PyResult<PyRender> {
         let is_batch = camera.is_instance_of::<PyList>();
         let cameras = match is_batch {
             true => batch(camera.extract()?)?,
-            false => vec![camera.extract::<Camera<'_>>()?.checked()?],
+            false => vec![camera.extract::<PyCamera<'_>>()?.checked()?],
         };
         let views = call(py, || {
             let mut renderer = self.lock();
@@ -95,7 +98,7 @@ impl Renderer {
         }
         let [color, depth, alpha] = views;
         let of_color = [&shape[..], &[3]].concat();
-        Ok(Render {
+        Ok(PyRender {
             color: array(py, &of_color, color)?.unbind(),
             depth: array(py, &shape, depth)?.unbind(),
             alpha: array(py, &shape, alpha)?.unbind(),
@@ -104,21 +107,26 @@ impl Renderer {
 
     /// Renders a layer, as `nightsplat render --layer` names it, to (H, W, 3), float32; one of a single channel is
     /// repeated in all three.
-    fn layer<'py>(&self, py: Python<'py>, camera: Camera<'_>, name: &str) -> PyResult<Floats<'py>> {
+    fn layer<'py>(
+        &self,
+        py: Python<'py>,
+        camera: PyCamera<'_>,
+        name: &str,
+    ) -> PyResult<Floats<'py>> {
         let camera = camera.checked()?;
         of_image(py, &call(py, || self.lock().layer(&camera, name.parse()?))?)
     }
 }
 
-impl Renderer {
+impl PyRenderer {
     fn lock(&self) -> MutexGuard<'_, ModelRenderer> {
         self.renderer.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 /// The cameras of a batch: of one size, at least one.
-fn batch(cameras: Vec<Camera<'_>>) -> PyResult<Vec<nightsplat::Camera>> {
-    let cameras = cameras.iter().map(Camera::checked).collect::<PyResult<Vec<_>>>()?;
+fn batch(cameras: Vec<PyCamera<'_>>) -> PyResult<Vec<nightsplat::Camera>> {
+    let cameras = cameras.iter().map(PyCamera::checked).collect::<PyResult<Vec<_>>>()?;
     let mut sizes = cameras.iter().map(|camera| [camera.width, camera.height]);
     let Some(first) = sizes.next() else {
         return Err(usage("a batch has no camera; pass at least one"));

@@ -2,20 +2,20 @@
 
 use std::collections::VecDeque;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use nightsplat::train::{PlanSource, PlannedRun, RequestedSettings};
-use nightsplat::{Ended, Gpu, Preset, StepReport, Trainer};
+use nightsplat::{Ended, Preset, StepReport, Trainer};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::device::{Device, opened};
-use crate::model::Model;
+use crate::device::{PyDevice, opened};
+use crate::model::PyModel;
 use crate::{assignments, call, objects};
 
 /// A step of a training.
-#[pyclass(frozen, get_all, module = "nightsplat")]
-pub(crate) struct Step {
+#[pyclass(frozen, get_all, name = "Step", module = "nightsplat")]
+pub(crate) struct PyStep {
     /// Its number, from 1.
     step: u64,
     /// The name of the view that was rendered.
@@ -28,7 +28,7 @@ pub(crate) struct Step {
     milliseconds: f64,
 }
 
-impl From<StepReport> for Step {
+impl From<StepReport> for PyStep {
     fn from(report: StepReport) -> Self {
         let StepReport { step, view, loss, gaussians, milliseconds, .. } = report;
         Self { step, view, loss, gaussians, milliseconds }
@@ -38,26 +38,25 @@ impl From<StepReport> for Step {
 /// A model in training: an iterator of its steps, which are done in batches of half a second, so that the model may be
 /// ahead. Other threads of Python run meanwhile. Ctrl-C raises KeyboardInterrupt between two batches; the training can
 /// go on then, or be saved.
-#[pyclass(frozen, module = "nightsplat")]
-pub(crate) struct Training {
-    state: Mutex<State>,
+#[pyclass(frozen, name = "Training", module = "nightsplat")]
+pub(crate) struct PyTraining {
+    state: Mutex<TrainingState>,
     /// Every setting, as config.toml has them.
     #[pyo3(get)]
     settings: Py<PyAny>,
     /// What the photographs decided, with reasons; None without a plan.
     #[pyo3(get)]
     plan: Py<PyAny>,
-    _device: Arc<Gpu>,
 }
 
-struct State {
+struct TrainingState {
     trainer: Trainer,
     /// Steps that are done, and not returned yet.
     reports: VecDeque<StepReport>,
     ended: Option<Ended>,
 }
 
-impl State {
+impl TrainingState {
     /// Trains for about half a second; at the end of the run, chooses its best model.
     fn advance(&mut self) -> nightsplat::Result<()> {
         if self.trainer.has_ended() {
@@ -70,12 +69,12 @@ impl State {
 }
 
 #[pymethods]
-impl Training {
+impl PyTraining {
     fn __iter__(training: PyRef<'_, Self>) -> PyRef<'_, Self> {
         training
     }
 
-    fn __next__(&self, py: Python<'_>) -> PyResult<Option<Step>> {
+    fn __next__(&self, py: Python<'_>) -> PyResult<Option<PyStep>> {
         loop {
             py.check_signals()?;
             let (report, has_ended) = call(py, || {
@@ -83,15 +82,15 @@ impl Training {
                 Ok((state.reports.pop_front(), state.ended.is_some()))
             })?;
             if report.is_some() || has_ended {
-                return Ok(report.map(Step::from));
+                return Ok(report.map(PyStep::from));
             }
             call(py, || self.lock().advance())?;
         }
     }
 
     /// The model as it is now; after the last step, the best of the run.
-    fn model(&self, py: Python<'_>) -> PyResult<Model> {
-        call(py, || self.lock().trainer.model()).map(Model)
+    fn model(&self, py: Python<'_>) -> PyResult<PyModel> {
+        call(py, || self.lock().trainer.model()).map(PyModel)
     }
 
     /// Writes a checkpoint, from which `train(..., resume=path)` continues to the same bits.
@@ -106,8 +105,8 @@ impl Training {
     }
 }
 
-impl Training {
-    fn lock(&self) -> MutexGuard<'_, State> {
+impl PyTraining {
+    fn lock(&self) -> MutexGuard<'_, TrainingState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -123,9 +122,9 @@ pub(crate) fn train(
     preset: Option<&str>,
     plan: bool,
     resume: Option<PathBuf>,
-    device: Option<&Bound<'_, Device>>,
+    device: Option<&Bound<'_, PyDevice>>,
     settings: Option<&Bound<'_, PyDict>>,
-) -> PyResult<Training> {
+) -> PyResult<PyTraining> {
     let settings = settings.map_or_else(|| Ok(PyDict::new(py)), |given| given.copy())?;
     settings.set_item("dataset", dataset)?;
     // As the option: a stated length switches early stopping off, and with it the held-out views.
@@ -146,10 +145,9 @@ pub(crate) fn train(
         Ok((trainer, run))
     })?;
     let PlannedRun { config, plan, .. } = run;
-    Ok(Training {
-        state: Mutex::new(State { trainer, reports: VecDeque::new(), ended: None }),
+    Ok(PyTraining {
+        state: Mutex::new(TrainingState { trainer, reports: VecDeque::new(), ended: None }),
         settings: objects(py, &config)?.unbind(),
         plan: objects(py, &plan)?.unbind(),
-        _device: device,
     })
 }

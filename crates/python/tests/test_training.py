@@ -44,7 +44,8 @@ def test_a_training_has_the_bits_of_the_command(run, room, device, tmp_path):
 
 
 def test_without_a_plan_settings_are_those_of_the_preset(room, device):
-    training = nightsplat.train(room, preset="paper", steps=1, device=device, tone={"curve": "ap3", "alpha": 0.1})
+    tone = {"curve": "ap3", "alpha": 0.1}
+    training = nightsplat.train(room, preset="paper", steps=1, device=device, tone=tone)
     assert training.plan is None
     assert training.settings["tone"]["curve"] == "ap3" and training.settings["tone"]["alpha"] == 0.1
     assert nightsplat.train(room, plan=False, steps=1, device=device).plan is None
@@ -73,7 +74,7 @@ import pathlib, sys, time
 import nightsplat
 
 room, out = map(pathlib.Path, sys.argv[1:])
-training = nightsplat.train(room, plan=False, steps=100000, stop={"views": 0}, device=nightsplat.Device(validation=True))
+training = nightsplat.train(room, plan=False, steps=100000, device=nightsplat.Device(validation=True))
 done = 0
 try:
     for step in training:

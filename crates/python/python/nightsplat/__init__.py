@@ -1,8 +1,8 @@
 """3D Gaussian Splatting from dark photographs, on any Vulkan device.
 
-Images are arrays (H, W, 3) of float32, sRGB-encoded, black 0 and white 1; functions take uint8 and uint16 as well. Lengths
-are in units of the dataset's world. Calls release the interpreter; warnings go to the module `logging`. Every error is an
-`Error`, in one line that names the object and the remedy.
+Images are arrays (H, W, 3) of float32, sRGB-encoded, black 0 and white 1; functions take uint8 and uint16 as well.
+Lengths are in units of the dataset's world. Without a device, the best one is opened. Calls release the interpreter;
+warnings go to the module `logging`. Every error is an `Error`, in one line that names the object and the remedy.
 """
 
 from ._camera import Camera

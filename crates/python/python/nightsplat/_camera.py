@@ -15,8 +15,8 @@ Four = tuple[float, float, float, float]
 class Camera:
     """A pinhole or fisheye camera with its pose.
 
-    View space has the axes of OpenCV: x right, y down, z forward. Pixel coordinates: the image's corner is (0, 0), pixel
-    centres are at +0.5.
+    View space has the axes of OpenCV: x right, y down, z forward. Pixel coordinates: the image's corner is (0, 0),
+    pixel centres are at +0.5.
 
     Raises UsageError if the pose is not rigid, or the lens cannot be used.
     """
@@ -42,7 +42,7 @@ class Camera:
 
     @staticmethod
     def perspective(view_from_world: npt.ArrayLike, fov_y: float, size: tuple[int, int]) -> Camera:
-        """A pinhole with square pixels and a centred principal point; `fov_y` is the vertical field of view, radians."""
+        """A pinhole with square pixels, centred; `fov_y` is the vertical field of view, radians."""
         focal = size[1] / 2 / float(np.tan(fov_y / 2))
         return Camera(view_from_world, size, (focal, focal))
 

@@ -46,8 +46,8 @@ def planes(array: object) -> npt.NDArray[np.float32]:
         from ._native import UsageError
 
         raise UsageError(
-            f"an array of shape {values.shape} of {values.dtype} is no image; pass (H, W, 3) of uint8, of uint16, or of "
-            "floats from 0 to 1"
+            f"an array of shape {values.shape} of {values.dtype} is no image; pass (H, W, 3) of uint8, of uint16, "
+            "or of floats from 0 to 1"
         )
     white = np.float32(1) if values.dtype.kind == "f" else np.float32(np.iinfo(values.dtype).max)
     return np.ascontiguousarray(np.moveaxis(values.astype(np.float32) / white, 2, 0))
