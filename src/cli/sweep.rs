@@ -120,17 +120,17 @@ pub fn run(args: &SweepArgs) -> Result<()> {
     }
     let dataset = std::path::absolute(&args.dataset)?;
     let name = dataset.file_name().unwrap_or_default().to_string_lossy();
-    run_titled(args, &format!("Sweep of {name}"), &[], &[])
+    run_titled(args, &format!("Sweep of {name}"), &[], None)
 }
 
-/// As [`run`], with a title, an introduction and links for the page.
+/// As [`run`], with a title, an introduction and the page of a model for the page.
 pub(super) fn run_titled(
     args: &SweepArgs,
     title: &str,
     intro: &[String],
-    links: &[[String; 2]],
+    window: Option<[String; 2]>,
 ) -> Result<()> {
-    let Some((rows, failures)) = swept(args, title, intro, links)? else { return Ok(()) };
+    let Some((rows, failures)) = swept(args, title, intro, window)? else { return Ok(()) };
     if let Some(failure) = failures.first() {
         let (failed, all) = (failures.len(), rows.runs);
         anyhow::bail!("{failed} of {all} points failed; the first: {}", failure.reason);
@@ -143,7 +143,7 @@ fn swept(
     args: &SweepArgs,
     title: &str,
     intro: &[String],
-    links: &[[String; 2]],
+    window: Option<[String; 2]>,
 ) -> Result<Option<(SweepResults, Vec<FailedPoint>)>> {
     check_writable(&args.out)?;
     let (trainings, dataset) = plan(args)?;
@@ -182,7 +182,7 @@ fn swept(
         rows: &rows,
         title: title.to_owned(),
         intro: intro.iter().cloned().chain([settings]).collect(),
-        links: links.to_vec(),
+        window,
         adaptive_offset: adaptive_offset(&trainings, &dataset),
         failures: &failures,
     };

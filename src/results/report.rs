@@ -23,6 +23,8 @@ mod table;
 pub struct Report {
     /// The heading, also the window's title.
     pub title: String,
+    /// A page to look into, first of all: address and text.
+    pub window: Option<[String; 2]>,
     /// The paragraphs under the heading.
     pub intro: Vec<String>,
     /// Links under the introduction: address and text.
@@ -115,6 +117,11 @@ impl Report {
             include_str!("report/style.css")
         );
         // Writing to a string cannot fail, so the results below are ignored.
+        if let Some([address, text]) = &self.window {
+            let (address, text) = (escape(address), escape(text));
+            let frame = format!("<iframe src=\"{address}\" title=\"{text}\"></iframe>");
+            let _ = writeln!(html, "{frame}\n<p><a href=\"{address}\">{text}</a></p>");
+        }
         for paragraph in &self.intro {
             let _ = writeln!(html, "<p>{}</p>", escape(paragraph));
         }

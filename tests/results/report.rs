@@ -95,6 +95,7 @@ fn page(text: &str) -> String {
         title: text.into(),
         intro: vec![text.into()],
         links: vec![[text.into(), text.into()]],
+        window: Some([text.into(), text.into()]),
         facts: vec![TextTable { title: text.into(), rows: vec![[text.into(), text.into()]] }],
         tables: vec![table()],
         charts: vec![Chart::new(text, text, vec![series])],

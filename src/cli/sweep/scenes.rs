@@ -40,7 +40,7 @@ pub(super) fn run(args: &SweepArgs) -> Result<()> {
             ..args.clone()
         };
         let title = format!("Sweep of {name}");
-        let Some((rows, failures)) = super::swept(&args_of_scene, &title, &[], &[])? else {
+        let Some((rows, failures)) = super::swept(&args_of_scene, &title, &[], None)? else {
             continue;
         };
         failed.extend(failures.into_iter().map(|failure| (name.clone(), failure)));
