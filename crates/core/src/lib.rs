@@ -13,6 +13,7 @@
 //! - [`camera`]: cameras and lens distortion
 //! - [`image`]: images in memory
 //! - [`curves`]: the formulas of tone curves
+//! - [`watch`]: following long work, and stopping it
 
 pub mod camera;
 pub mod csv;
@@ -26,5 +27,6 @@ pub mod ply;
 pub mod random;
 pub mod settings;
 pub mod table;
+pub mod watch;
 
 pub use error::{Error, Result, Stop};
