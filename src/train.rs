@@ -2,6 +2,7 @@
 
 mod batching;
 mod cache;
+mod call;
 mod checkpoint;
 mod clock;
 mod config;

@@ -23,6 +23,7 @@ use std::sync::{Mutex, PoisonError};
 
 use nightsplat_core::camera::Camera;
 use nightsplat_core::natural;
+use nightsplat_core::watch::Stage;
 use nightsplat_photographs::dataset::{self, Borders, Dataset, LoadOptions, Split, View};
 use nightsplat_photographs::findings::{brought_near_white, findings};
 use nightsplat_photographs::image::{
@@ -329,9 +330,11 @@ fn read(
         false => Borders::of_photographs(all, options),
         true => Borders::default(),
     };
+    let stage = Stage::begin("diagnosing photographs", files.len());
     let mut photographs = vec![];
     for files in files.chunks(decoded_at_once(largest)) {
         let read = files.par_iter().map(|file| {
+            stage.next()?;
             let name = file.name.clone();
             let load = || PhotographStatistics::load(file, options, &borders, balance, &colours);
             Ok((name, load()?))

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use glam::UVec2;
 use nightsplat_core::camera::Patch;
+use nightsplat_core::watch::Stage;
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::scene_tone::photographs;
@@ -92,7 +93,9 @@ impl Views {
         let mut levels = vec![];
         levels.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
         let mut curves = vec![];
+        let stage = Stage::begin("uploading photographs", photographs(dataset).count());
         for (at, (index, view)) in photographs(dataset).enumerate() {
+            stage.next()?;
             let Some(tone_mapping) = scene.tone_mapping(view)? else { continue };
             curves.push(tone_mapping.parameters);
             let Some(image) = view.loaded()? else { continue };

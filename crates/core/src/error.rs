@@ -199,6 +199,13 @@ pub enum Error {
         /// What requested it.
         cause: Stop,
     },
+    /// Watched work was stopped on request ([`Watch::stop`](crate::watch::Watch::stop)), or a call that trains ends
+    /// within its time.
+    #[error("stopped on request while {stage}")]
+    Halted {
+        /// The stage of the work.
+        stage: &'static str,
+    },
     /// The result of a checked pass differs from its CPU reference.
     #[error(
         "the device disagrees with the CPU references: {what}; update the driver, or report this with the output of \
@@ -247,6 +254,7 @@ impl Error {
             | Self::BatchStopped { cause, .. }
             | Self::StageStopped { cause, .. } => cause.exit_code(),
             Self::Output { .. }
+            | Self::Halted { .. }
             | Self::NotFinite { .. }
             | Self::ParameterNotFinite { .. }
             | Self::Disagrees { .. } => 1,

@@ -15,6 +15,7 @@
 //! - [`camera`]: cameras and lens distortion
 //! - [`image`]: images in memory
 //! - [`curves`]: the formulas of tone curves
+//! - [`watch`]: following long work, and stopping it
 
 pub mod camera;
 pub mod csv;
@@ -30,5 +31,6 @@ pub mod ply;
 pub mod random;
 pub mod settings;
 pub mod table;
+pub mod watch;
 
 pub use error::{Error, Result, Stop};

@@ -207,7 +207,7 @@ fn every_bad_model_is_refused_by_code_and_name() {
     let mut trainer = null_mut();
     // SAFETY: valid.
     unsafe {
-        let result = nsp_trainer_create(device, c".".as_ptr(), null(), &mut trainer);
+        let result = nsp_trainer_create(device, c".".as_ptr(), null(), null(), &mut trainer);
         refused(result, NSP_ERROR_USAGE, &["nsp_trainer_create", "record-only"]);
     }
     other.end();
@@ -388,7 +388,8 @@ fn a_lost_device_is_a_code_and_everything_can_be_destroyed() {
     let mut trainer = null_mut();
     // SAFETY: valid.
     unsafe {
-        let result = nsp_trainer_create(session.device, dataset.as_ptr(), null(), &mut trainer);
+        let result =
+            nsp_trainer_create(session.device, dataset.as_ptr(), null(), null(), &mut trainer);
         refused(result, NSP_ERROR_LOST, &["nsp_trainer_create", "was lost"]);
         assert!(trainer.is_null());
         ok(nsp_frames_done(session.device, u64::MAX));

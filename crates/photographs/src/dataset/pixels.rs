@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use nightsplat_core::camera::{Camera, Lens};
 use nightsplat_core::hash::Hasher;
+use nightsplat_core::watch::Stage;
 use nightsplat_core::{Error, Result};
 use rayon::prelude::*;
 
@@ -119,7 +120,9 @@ fn load_with(
     let at_once = decoded_at_once(largest.max().unwrap_or_default());
     let originals = Allowance::new(bytes_for_originals(&groups, options));
     let colours = [ColourCounts::of_levels(levels), ColourCounts::new("reference image")];
+    let count = groups.iter().map(|group| group.files.len()).sum();
     let loading = Loading {
+        stage: Stage::begin("decoding photographs", count),
         options,
         at_once,
         observer,
@@ -188,6 +191,7 @@ impl LensGroup {
 
 /// What loading the views has in common.
 struct Loading<'a> {
+    stage: Stage,
     options: &'a LoadOptions,
     /// Number of photographs that are decoded concurrently.
     at_once: usize,
@@ -314,7 +318,10 @@ fn load_group(group: LensGroup, loading: &Loading<'_>) -> Result<Vec<LoadedView>
     let mut loaded = vec![];
     while !group.is_empty() {
         let now: Vec<_> = group.drain(..group.len().min(loading.at_once)).collect();
-        let now = now.into_par_iter().map(|source| views.load(source));
+        let now = now.into_par_iter().map(|source| {
+            loading.stage.next()?;
+            views.load(source)
+        });
         loaded.extend(now.collect::<Result<Vec<_>>>()?);
     }
     Ok(loaded)
