@@ -14,6 +14,7 @@ mod injected;
 mod light;
 mod lost_work;
 mod model_files;
+mod power_cut;
 mod profile;
 mod rendered;
 mod report;
