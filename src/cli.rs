@@ -7,6 +7,7 @@ use std::path::Path;
 use anyhow::Result;
 use clap::{FromArgMatches, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
+use nightsplat_core::output::in_a_line;
 pub use nightsplat_core::output::one_line;
 use nightsplat_core::settings::Setting;
 use nightsplat_photographs::image::{Image, ImageFile};
@@ -52,6 +53,7 @@ mod words;
 
 pub use hints::hint;
 pub use phases::Phases;
+pub use signals::report_long_files;
 pub use stopped::ending;
 pub use tell::tell_on_stderr;
 use tell::{print, tell};
@@ -212,7 +214,7 @@ fn quoted(word: &str) -> String {
 pub fn event_field(writer: &mut Writer<'_>, field: &Field, value: &dyn fmt::Debug) -> fmt::Result {
     let text = format!("{value:?}");
     match field.name() {
-        "message" => write!(writer, "{}", one_line(&text)),
+        "message" => write!(writer, "{}", in_a_line(&text)),
         name => write!(writer, "{name}={}", one_line(&text)),
     }
 }
@@ -302,9 +304,12 @@ mod tests {
             tracing_subscriber::registry().with(lines.clone()),
             || {
                 tracing::warn!("skipped {}", "no\nerror: lost\u{202e}.png");
+                tracing::warn!("skipped {}", "x".repeat(100_000));
             },
         );
-        assert_eq!(*lines.0.lock().unwrap(), r"skipped no\nerror: lost\u{202e}.png");
+        let lines = lines.0.lock().unwrap();
+        assert!(lines.starts_with(r"skipped no\nerror: lost\u{202e}.pngskipped xxx"), "{lines}");
+        assert!(lines.len() < 1100 && lines.ends_with("x ..."), "{lines}");
     }
 
     #[test]

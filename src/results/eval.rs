@@ -6,13 +6,14 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use nightsplat_core::camera::{Camera, TrainingFrame};
-use nightsplat_core::output::own_file;
+use nightsplat_core::output::{create_folder, own_file};
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
 use nightsplat_photographs::metrics::{self, Scores, psnr_of_counted};
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
 
+use crate::Result;
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::lpips::Lpips;
@@ -23,7 +24,6 @@ use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::{DeviceGaussians, Shape};
 use crate::targets::Targets;
 use crate::train::{Networks, Rendered, TrainConfig};
-use crate::{Error, Result};
 
 mod layers;
 mod lit;
@@ -258,8 +258,7 @@ impl ScoredImages<'_> {
         };
         for (name, image) in [("renders", &self.render), (targets, &self.target)] {
             let folder = own_file(own_file(folder.to_owned())?.join(name))?;
-            std::fs::create_dir_all(&folder)
-                .map_err(|error| Error::output(&folder, format!("cannot be created ({error})")))?;
+            create_folder(&folder)?;
             let path = own_file(folder.join(format!("{}.png", self.view.name)))?;
             self.view.upright(image.clone()).save_png8(path)?;
         }

@@ -63,7 +63,8 @@ impl SettingsLayer {
     pub fn of_toml(text: &str, origin: &Origin) -> Result<Self> {
         let table: Table = text.parse().map_err(|error: toml::de::Error| {
             let at = error.span().map(|span| line_at(text, span.start));
-            Error::Usage(format!("is not TOML: {}{}", error.message(), at.unwrap_or_default()))
+            let (problem, at) = (error.message(), at.unwrap_or_default());
+            Error::Usage(format!("is not TOML: {problem}{at}; mend it or save it as UTF-8"))
         })?;
         let mut layer = Self::default();
         for (key, value) in flat("", table) {

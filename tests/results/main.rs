@@ -16,6 +16,7 @@ mod light;
 mod lost_work;
 mod model_files;
 mod other_programs;
+mod power_cut;
 mod profile;
 mod rendered;
 mod report;

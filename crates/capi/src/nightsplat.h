@@ -480,7 +480,8 @@ NspResult nsp_camera_from_matrices(const float *view,
                                    uint32_t height,
                                    struct NspCamera *camera);
 
-// Loads a model: PLY, SPZ, SOG, or a run directory. The upload is part of the next recording.
+// Loads a model: PLY, SPZ, SOG, or a run directory. The upload is part of the next recording. Gaussians that are not
+// finite are left out, which a warning of the log counts.
 NspResult nsp_model_load(struct NspDevice *device, const char *path, struct NspModel **model);
 
 // Creates a model from arrays: means (count, 3); rotations (count, 4) as w, x, y, z; natural logarithms of scales

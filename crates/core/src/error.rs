@@ -221,13 +221,13 @@ impl Error {
     /// An [`Error::Input`]. The problem may quote the file: it becomes one line of limited length.
     #[doc(hidden)]
     pub fn input(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
-        Self::Input { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
+        Self::Input { path: path.as_ref().to_owned(), problem: in_a_line(&problem.into()) }
     }
 
     /// An [`Error::Output`].
     #[doc(hidden)]
     pub fn output(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
-        Self::Output { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
+        Self::Output { path: path.as_ref().to_owned(), problem: in_a_line(&problem.into()) }
     }
 
     /// Whether this is no failure: somebody stopped the work, which goes on when the command is repeated.
@@ -263,9 +263,9 @@ impl Error {
 }
 
 /// Escapes what [`one_line`] escapes, and truncates to a thousand characters.
-fn in_a_line(text: String) -> String {
+pub fn in_a_line(text: &str) -> String {
     const MOST: usize = 1000;
-    let line = one_line(&text);
+    let line = one_line(text);
     match line.char_indices().nth(MOST) {
         Some((end, _)) => format!("{} ...", &line[..end]),
         None => line.into_owned(),

@@ -227,7 +227,7 @@ impl RunDirectory {
     pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
         let _phase = tracing::info_span!("files").entered();
         self.flush_log()?;
-        flush_to_disk(&self.path, &["config.toml", PLAN, LOG])?;
+        flush_to_disk(&self.path, &["config.toml", PLAN, VIEWS, LOG, HELD_OUT, PROGRESS])?;
         let newest = generations::rotate(&self.path)?;
         trainer.save_checkpoint(&newest)?;
         self.save_trained(trainer)
