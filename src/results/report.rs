@@ -81,10 +81,12 @@ impl Picture {
 }
 
 impl Report {
-    /// The page as HTML: text, images, tables, charts.
+    /// The page as HTML: the first table of text, images, the other tables, charts.
     pub fn html(&self) -> String {
-        let facts: String = self.facts.iter().map(TextTable::html).collect();
-        self.page(&(facts + &self.pictures_html() + &self.tables_html() + &self.charts_html()))
+        let mut facts = self.facts.iter().map(TextTable::html);
+        let first = facts.next().unwrap_or_default() + &self.pictures_html();
+        let others = facts.collect::<String>() + &self.tables_html() + &self.charts_html();
+        self.page(&(first + &others))
     }
 
     /// The page as HTML with the charts first and the tables last.
