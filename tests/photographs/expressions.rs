@@ -100,6 +100,8 @@ fn a_configuration_keeps_formula_constants_and_bounds() {
     assert_eq!(other.tone, settings("t^0.45"));
     let open = ["tone.curve=a*t", "tone.constants.a=0.7"].map(str::to_owned);
     assert_eq!(config.with(&open).unwrap().tone.constants, [0.7]);
+    let missing = config.with(&["tone.curve=a*t".to_owned()]).unwrap_err().to_string();
+    assert!(missing.contains("a of `a*t` has no value"), "{missing}");
     let gamma = "curve = \"gamma\"\nbounds = { a = [0.1, 1.0] }";
     assert!(toml::from_str::<ToneSettings>(gamma).unwrap_err().to_string().contains("no bounds"));
 }

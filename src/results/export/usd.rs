@@ -60,6 +60,8 @@ fn write_stage(out: &mut String, model: &Gaussians, provenance: &Provenance) -> 
     writeln!(out, "        string[] provenance = [{}]", lines.join(", "))?;
     writeln!(out, "    }}")?;
     writeln!(out, "    defaultPrim = \"model\"")?;
+    // Photographs show no scale.
+    writeln!(out, "    metersPerUnit = 1")?;
     writeln!(out, "    upAxis = \"Y\"")?;
     writeln!(out, ")\n")?;
     writeln!(out, "def ParticleField3DGaussianSplat \"model\" (")?;

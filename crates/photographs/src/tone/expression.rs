@@ -312,7 +312,8 @@ impl Expression {
     ) -> Result<Self, String> {
         let mut changed = self.clone();
         for (one, &value) in changed.constants.iter_mut().zip(values) {
-            let stated = if one.default.is_nan() { bounds_around(value) } else { one.bounds };
+            let is_new = one.default.is_nan() && !value.is_nan();
+            let stated = if is_new { bounds_around(value) } else { one.bounds };
             let bounds = bounds.get(one.name.as_ref()).copied().unwrap_or(stated);
             *one = constant(one.name.to_string(), value, bounds);
         }
@@ -321,16 +322,6 @@ impl Expression {
             Some(name) => Err(format!("the formula `{}` has no constant `{name}`", self.formula)),
             None => Ok(changed),
         }
-    }
-
-    /// The same formula with these values of its constants, from which a fit starts.
-    #[must_use]
-    pub fn starting_at(&self, values: &[f64]) -> Self {
-        let mut changed = self.clone();
-        for (one, &value) in changed.constants.iter_mut().zip(values) {
-            *one = constant(one.name.to_string(), value, one.bounds);
-        }
-        changed
     }
 
     /// Whether it is a function of the stored value x instead of t.
@@ -363,13 +354,16 @@ impl Expression {
         let formula = &self.formula;
         for (Constant { name, bounds: [low, high], .. }, value) in self.constants.iter().zip(values)
         {
-            if !(low < high && low.is_finite() && high.is_finite()) {
-                return Err(format!("the bounds of {name} in `{formula}` are {low} and {high}"));
-            }
             if value.is_nan() {
                 return Err(format!(
                     "the constant {name} of `{formula}` has no value; write `{formula}; {name} = VALUE`, or fit it \
                      with `nightsplat tone fit --family`"
+                ));
+            }
+            let is_range = low < high && low.is_finite() && high.is_finite();
+            if !is_range {
+                return Err(format!(
+                    "the bounds of {name} in `{formula}` are {low} and {high}; give a lower and a higher number"
                 ));
             }
         }
