@@ -13,7 +13,7 @@ use nightsplat_photographs::metrics::{self, Scores, psnr_of_counted};
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
 
-use crate::Result;
+use crate::{Error, Result};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::lpips::Lpips;

@@ -41,7 +41,7 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, ModelFacts)> {
         return Ok((gaussians, facts_of_run(&config, file.as_ref())));
     }
     let (facts, mut gaussians) = match PartFile::open(path, 1)? {
-        Some(file) => (*file.facts(), file.whole()?),
+        Some(file) => (file.facts().clone(), file.whole()?),
         None => read_whole(path)?,
     };
     let count = gaussians.count;
