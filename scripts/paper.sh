@@ -55,8 +55,13 @@ if [ -n "$quick" ]; then
         [ -d "$data/$name" ] ||
             "$NIGHTSPLAT" synth "$data/$name" --width 64 --height 48 --views 16 --seed "$seed" > "$out/log.txt"
     done
-    options+=(--steps 20 --set stop.views=0)
+    options+=(--steps 20)
 fi
+
+# OPTIONS override a part's own.
+length=(--steps 5000) half=(--downscale 2)
+case " ${options[*]} " in *" --steps "*) length=() ;; esac
+case " ${options[*]} " in *" --downscale "*) half=() ;; esac
 
 scenes=()
 for name in ${names//,/ }; do
@@ -167,7 +172,7 @@ case $part in
         tool tone list linear ase ap3 --dataset "${scenes[0]}" --plot "$out/curves.svg" > /dev/null
         scenes=("${scenes[0]}")
         # A rehearsal has three of the 37 curves.
-        sweep paper --table leaderboard --offset 0.103 --downscale 2 ${quick:+--curves softexp,ase,ap3}
+        sweep paper --table leaderboard --offset 0.103 "${half[@]}" ${quick:+--curves softexp,ase,ap3}
         ;;
     offset)
         for scene in "${scenes[@]}"; do
@@ -177,8 +182,8 @@ case $part in
         scenes=("${scenes[0]}")
         sweep paper --table offset --presets lom
         ;;
-    alpha) sweep paper --table alpha --presets realx3d --steps 5000 ;;
-    gain) sweep paper --table gain --presets realx3d --steps 5000 ;;
+    alpha) sweep paper --table alpha --presets realx3d "${length[@]}" ;;
+    gain) sweep paper --table gain --presets realx3d "${length[@]}" ;;
     histogram)
         measured "$out/skewness" skewness after_skewness
         for scene in "${scenes[@]}"; do
