@@ -13,7 +13,6 @@ use nightsplat_photographs::metrics::{self, Scores, psnr_of_counted};
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
 
-use crate::{Error, Result};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::lpips::Lpips;
@@ -24,6 +23,7 @@ use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::{DeviceGaussians, Shape};
 use crate::targets::Targets;
 use crate::train::{Networks, Rendered, TrainConfig};
+use crate::{Error, Result};
 
 mod layers;
 mod lit;

@@ -206,8 +206,8 @@ fn the_page_shows_every_photograph_and_tables_have_what_the_curve_uses() {
         };
         assert!(nine < ten, "{text}");
     }
-    let own = printed(&table.display().to_string());
-    assert!(!own.contains("delta0") && !own.contains(" r "), "{own}");
+    let of_table = printed(&table.display().to_string());
+    assert!(!of_table.contains("delta0") && !of_table.contains(" r "), "{of_table}");
 }
 
 #[test]

@@ -82,9 +82,9 @@ fn targets_of_another_program_are_trained_on_and_labelled_everywhere() {
         format!("train {set} --out {} --model plain --sh-degree 1 --steps 30 {options}", path(out))
     };
     let (stdout, message) = run(&train("theirs", &format!("--targets {toned}")), 0);
-    let said = stdout + &message;
-    assert!(said.contains("targets of another program, toned"), "{said}");
-    assert!(said.contains("% of their pixels are clipped at white"), "{said}");
+    let printed = stdout + &message;
+    assert!(printed.contains("targets of another program, toned"), "{printed}");
+    assert!(printed.contains("% of their pixels are clipped at white"), "{printed}");
 
     // Only the rounding to 8 bits differs from the curve that made them.
     succeed(&train("ours", "--curve ap3"));
@@ -111,7 +111,7 @@ fn targets_of_another_program_are_trained_on_and_labelled_everywhere() {
         &["targets of another program have no curve"],
     );
 
-    // Resumed runs keep them, and what scores compare with is said.
+    // Resumed runs keep them, and what scores compare with is printed.
     fs::remove_dir_all(workspace.path("set/high")).unwrap();
     let label = json(&succeed(&format!("eval {} --json", path("theirs"))))["against"].clone();
     assert!(label.as_str().unwrap().contains("targets of another program"), "{label}");

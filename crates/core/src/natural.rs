@@ -4,7 +4,7 @@ use std::cmp::Ordering;
 
 /// Compares names, with the digits in them as numbers; names that are equal so are compared by their bytes.
 pub fn compare(a: &str, b: &str) -> Ordering {
-    runs(a).map(Run::of).cmp(runs(b).map(Run::of)).then(a.cmp(b))
+    runs(a).map(Run::new).cmp(runs(b).map(Run::new)).then(a.cmp(b))
 }
 
 /// The digits and the other parts of a name.
@@ -21,7 +21,7 @@ enum Run<'a> {
 }
 
 impl<'a> Run<'a> {
-    fn of(run: &'a [u8]) -> Self {
+    fn new(run: &'a [u8]) -> Self {
         let digits = &run[run.iter().take_while(|&&byte| byte == b'0').count()..];
         if run[0].is_ascii_digit() { Self::Number(digits.len(), digits) } else { Self::Text(run) }
     }

@@ -79,7 +79,7 @@ impl Watch {
         work()
     }
 
-    /// That of the work of this thread; one that nobody follows where there is none.
+    /// That of the work of this thread; without one, a watch without a report.
     #[doc(hidden)]
     pub fn current() -> Self {
         CURRENT.with_borrow(Self::clone)

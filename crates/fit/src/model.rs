@@ -23,7 +23,7 @@ const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
 #[derive(Clone, Debug)]
 pub(super) struct FitModel {
     /// With the curve's own constants.
-    pub(super) own: ToneSettings,
+    pub(super) initial: ToneSettings,
     slots: Vec<Variable>,
     /// In the order of every vector of values.
     pub(super) free: Vec<Constant>,
@@ -61,17 +61,18 @@ impl ChannelExposure {
 
 impl FitModel {
     pub(super) fn new(curve: &Tone, options: &FitOptions) -> Result<Self> {
-        let own = own_settings(curve);
+        let initial = own_settings(curve);
         let family = curve.family();
         if options.adapt && family.is_none() {
             return Err(Error::Usage(format!(
                 "`{curve}` has no black level and gain to adapt; make them constants of the formula"
             )));
         }
-        let mut slots: Vec<Variable> = (0..own.constants.len()).map(Variable::Constant).collect();
-        match own.white() {
+        let mut slots: Vec<Variable> =
+            (0..initial.constants.len()).map(Variable::Constant).collect();
+        match initial.white() {
             White::One => {}
-            White::P90 if options.adapt || own.alpha > 0.0 || own.gain_c > 0.0 => {
+            White::P90 if options.adapt || initial.alpha > 0.0 || initial.gain_c > 0.0 => {
                 slots.extend([Variable::Alpha, Variable::GainC]);
                 if family.is_some_and(|family| family.is_rescaled) {
                     slots.push(Variable::BaseGain);
@@ -90,35 +91,35 @@ impl FitModel {
         let free = slots.iter().map(|&slot| match slot {
             Variable::Constant(index) => {
                 let constant = curve.constants()[index].clone();
-                Constant { default: own.constants[index], ..constant }
+                Constant { default: initial.constants[index], ..constant }
             }
-            Variable::Theta => starting_at(THETA, own.theta),
-            Variable::Alpha => starting_at(ALPHA, own.alpha),
-            Variable::GainC => starting_at(GAIN_C, own.gain_c),
-            Variable::BaseGain => starting_at(BASE_GAIN, own.base_gain),
+            Variable::Theta => starting_at(THETA, initial.theta),
+            Variable::Alpha => starting_at(ALPHA, initial.alpha),
+            Variable::GainC => starting_at(GAIN_C, initial.gain_c),
+            Variable::BaseGain => starting_at(BASE_GAIN, initial.base_gain),
         });
-        Ok(Self { free: free.collect(), own, slots })
+        Ok(Self { free: free.collect(), initial, slots })
     }
 
     /// Whether photographs with different statistics have different curves of t.
     pub(super) fn differs_by_photograph(&self) -> bool {
         let is_shared = |slot: &Variable| matches!(slot, Variable::Constant(_));
-        self.own.white() == White::One || !self.slots.iter().all(is_shared)
+        self.initial.white() == White::One || !self.slots.iter().all(is_shared)
     }
 
     /// Whether the channels of a photograph have different curves.
     pub(super) fn differs_by_channel(&self) -> bool {
-        self.own.white() == White::ChannelMeans
+        self.initial.white() == White::ChannelMeans
     }
 
     /// Whether the shape f has constants; otherwise the curve rises for any black level, white and gain.
     pub(super) fn has_shape(&self) -> bool {
-        !self.own.constants.is_empty()
+        !self.initial.constants.is_empty()
     }
 
     /// The curve with these values.
     pub(super) fn settings(&self, values: &[f64]) -> ToneSettings {
-        let mut settings = self.own.clone();
+        let mut settings = self.initial.clone();
         for (&slot, &value) in self.slots.iter().zip(values) {
             match slot {
                 Variable::Constant(index) => settings.constants[index] = value,
@@ -134,14 +135,14 @@ impl FitModel {
     /// The curve of a photograph of this exposure with these values.
     pub(super) fn curve(&self, values: &[f64], exposure: &ChannelExposure) -> CurveOfT<'_, f64> {
         let settings = self.settings(values);
-        CurveOfT::new(&settings, expression(&self.own), exposure, |_, value| value)
+        CurveOfT::new(&settings, expression(&self.initial), exposure, |_, value| value)
     }
 
     /// [`Self::curve`] with its derivatives with respect to every value.
     pub(super) fn slopes(&self, values: &[f64], exposure: &ChannelExposure) -> Slopes<'_> {
         let settings = self.settings(values);
         let by = |&variable: &Variable| {
-            CurveOfT::new(&settings, expression(&self.own), exposure, |of, value| {
+            CurveOfT::new(&settings, expression(&self.initial), exposure, |of, value| {
                 let derivative = f64::from(u8::from(of == variable));
                 Dual { value, derivative }
             })

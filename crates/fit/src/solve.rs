@@ -247,7 +247,7 @@ impl<'a> Solver<'a> {
     fn best_of_many_starts(&self, rows: &[FitRow]) -> Vec<f64> {
         let free = &self.model.free;
         let start: Vec<f64> = free.iter().map(|constant| constant.start).collect();
-        let stream = Stream::new(u64::from(self.model.own.curve.constant()), 0);
+        let stream = Stream::new(u64::from(self.model.initial.curve.constant()), 0);
         let jittered = |draw: usize| -> Vec<f64> {
             let value = |(index, constant)| {
                 let normal = stream.normal((draw * free.len() + index) as u64);
@@ -274,7 +274,7 @@ impl<'a> Solver<'a> {
                 LevenbergMarquardt::new().with_tol(1e-10).with_patience(PATIENCE).minimize(problem);
             tracing::trace!(
                 "{}: {:?} after {}",
-                self.model.own.curve,
+                self.model.initial.curve,
                 report.termination,
                 report.number_of_evaluations
             );

@@ -20,7 +20,7 @@ const QUALITY: u8 = 82;
 pub struct ContactSheet {
     /// The heading.
     pub title: String,
-    cells: Vec<Cell>,
+    cells: Vec<SheetCell>,
     /// The number of photographs, and of those between two that are shown.
     count: usize,
     stride: usize,
@@ -28,7 +28,7 @@ pub struct ContactSheet {
 
 /// A photograph.
 #[derive(Clone, Debug)]
-struct Cell {
+struct SheetCell {
     name: String,
     /// What is wrong with it, or nothing.
     mark: String,
@@ -64,12 +64,12 @@ impl ContactSheet {
         let images = images.map(|image| self.shrunk(image));
         let size = [images[0].width, images[0].height];
         let images = images.map(|image| data_uri::jpeg_of_quality(&image, QUALITY));
-        self.cells.push(Cell { name: name.to_owned(), mark: mark.to_owned(), size, images });
+        self.cells.push(SheetCell { name: name.to_owned(), mark: mark.to_owned(), size, images });
     }
 
     /// The sheet as a section of a page, in the order of the names.
     pub(super) fn html(&self) -> String {
-        let mut cells: Vec<&Cell> = self.cells.iter().collect();
+        let mut cells: Vec<&SheetCell> = self.cells.iter().collect();
         cells.sort_by(|a, b| natural::compare(&a.name, &b.name));
         let title = escape(&self.title);
         let mut html = format!("<section>\n<h2>{title}</h2>\n");
@@ -78,7 +78,7 @@ impl ContactSheet {
             let _ = writeln!(html, "<p>{} of {} photographs.</p>", cells.len(), self.count);
         }
         html.push_str("<div class=\"sheet\">\n");
-        for Cell { name, mark, size: [width, height], images: [dark, lit] } in cells {
+        for SheetCell { name, mark, size: [width, height], images: [dark, lit] } in cells {
             let (name, mark) = (escape(name), escape(mark));
             let class = if mark.is_empty() { "" } else { " class=\"bad\"" };
             let picture = |uri: &str, kind: &str| {

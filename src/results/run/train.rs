@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::ImageFile as _;
 
-use super::directory::Progress;
+use super::directory::RunProgress;
 use super::files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE, TRAINED_WITH, trained_with};
 use super::meter::{ResourceMeter, ResourceUsage};
 use super::tensorboard::EventFile;
@@ -236,7 +236,7 @@ struct TrainLoop<'a> {
     begin: u64,
     /// Steps in a checkpoint.
     saved: u64,
-    progress: Vec<Progress>,
+    progress: Vec<RunProgress>,
     /// Created at the first scoring.
     score_reference: Option<ScoreReference>,
     /// For `TensorBoard`; created at the first event.
@@ -457,7 +457,7 @@ impl<'a> TrainLoop<'a> {
         self.write_event_scores(step, &evaluation)?;
         if self.config.eval_every > 0 {
             let (gaussians, spent) = (trainer.gaussian_count(), self.meter.spent(0));
-            if let Some(progress) = Progress::new(step, gaussians, &evaluation, &spent) {
+            if let Some(progress) = RunProgress::new(step, gaussians, &evaluation, &spent) {
                 // An extended run begins at a step that was scored before.
                 self.progress.retain(|earlier| earlier.step < step);
                 self.progress.push(progress);

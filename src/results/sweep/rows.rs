@@ -5,7 +5,7 @@ use serde_json::Value;
 use super::point::{PARTS, PRESET, RENDERS, SEED, SweepPoint};
 use super::run::SweepRun;
 use crate::results::eval::{AGAINST, WITH_REFERENCE};
-use crate::results::run::{Progress, load_progress};
+use crate::results::run::{RunProgress, load_progress};
 
 /// The results of a sweep.
 #[derive(Clone, Debug)]
@@ -32,7 +32,7 @@ pub struct SweepRow {
     /// `metrics.json` of each finished run.
     pub metrics: Vec<Value>,
     /// Intermediate scores of the first finished run.
-    pub progress: Vec<Progress>,
+    pub progress: Vec<RunProgress>,
 }
 
 impl SweepResults {

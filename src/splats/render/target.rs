@@ -366,7 +366,7 @@ impl SceneDepth<'_> {
 }
 
 /// A convention as kernels take it.
-struct Planes {
+struct TargetPlanes {
     is_linear: bool,
     is_reversed: bool,
     near: f32,
@@ -375,12 +375,12 @@ struct Planes {
 }
 
 impl DepthConvention {
-    fn planes(self) -> Planes {
+    fn planes(self) -> TargetPlanes {
         let (near, far) = match self {
             Self::Linear => (1.0, None),
             Self::Forward { near, far } | Self::Reversed { near, far } => (near, far),
         };
-        Planes {
+        TargetPlanes {
             is_linear: self == Self::Linear,
             is_reversed: matches!(self, Self::Reversed { .. }),
             near,

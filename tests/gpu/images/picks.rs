@@ -124,23 +124,23 @@ fn check_motion(
         let world = camera.view_from_world.inverse().transform_point3(point);
         let moved = |instance: &Instance<'_>| {
             let (pose, scale) = instance.before.unwrap_or((instance.pose, instance.scale));
-            let own = instance.pose.inverse().transform_point3(world) / instance.scale;
-            before.view_from_world.transform_point3(pose.transform_point3(scale * own))
+            let within = instance.pose.inverse().transform_point3(world) / instance.scale;
+            before.view_from_world.transform_point3(pose.transform_point3(scale * within))
         };
-        let place = |view: DVec3| {
-            let place = match camera.model {
+        let shift = |view: DVec3| {
+            let at = match camera.model {
                 CameraModel::Orthographic => view.truncate(),
                 _ => view.truncate() / view.z,
             };
-            before.focal * place + before.principal_point - pixel
+            before.focal * at + before.principal_point - pixel
         };
-        let of_world = place(before.view_from_world.transform_point3(world));
+        let of_world = shift(before.view_from_world.transform_point3(world));
         if !is_seen {
             assert!(vector.distance(of_world) < 2e-3, "{at}: {vector} {of_world}");
             continue;
         }
         let found =
-            instances.iter().position(|instance| place(moved(instance)).distance(*vector) < 2e-3);
+            instances.iter().position(|instance| shift(moved(instance)).distance(*vector) < 2e-3);
         seen[found.unwrap_or_else(|| panic!("pixel {at} moved by {vector}"))] += 1;
     }
     assert!(seen.iter().all(|&pixels| pixels > 20), "{seen:?}");
@@ -277,14 +277,14 @@ fn an_orthographic_camera_sees_along_parallel_rays() {
         mean += pixel / places.len() as f64;
     }
     assert!(mean.distance(center) < 0.05 && places.len() > 40, "{mean} of {}", places.len());
-    // Its mirror, seen from behind, has the harmonics of the other direction.
+    // Its mirror, seen from the far side, has the harmonics of the other direction.
     let turned = DAffine3::from_rotation_translation(
         DQuat::from_rotation_y(std::f64::consts::PI),
         DVec3::new(0.0, 0.0, 9.0),
     );
-    let (behind, _) = drawn(1.0, &Camera { view_from_world: turned, ..camera });
+    let (turned_round, _) = drawn(1.0, &Camera { view_from_world: turned, ..camera });
     let middle = |data: &[f32]| data.iter().take(PIXELS).fold(0.0f32, |a, b| a.max(*b));
-    let [front, back] = [middle(&near), middle(&behind)];
+    let [front, back] = [middle(&near), middle(&turned_round)];
     let share = (front - back) / (front + back);
     assert!((share - 0.4886025).abs() < 0.01, "{front} {back}");
 }

@@ -197,10 +197,10 @@ fn every_bad_model_is_refused_by_code_and_name() {
         ok(result);
         nsp_model_destroy(model);
     }
-    let is_said = |(level, line): &(i32, String)| {
+    let is_warned = |(level, line): &(i32, String)| {
         *level == 2 && line.contains("part.ply: 1 of ") && line.contains("are left out")
     };
-    assert!(lines.iter().any(is_said), "{lines:?}");
+    assert!(lines.iter().any(is_warned), "{lines:?}");
     model = null_mut();
     // SAFETY: NULL and the rest are refused.
     unsafe {

@@ -434,7 +434,7 @@ impl ViewLoader<'_> {
                 None => format!("{name}: no pixel is a number that its mask shows"),
             });
         }
-        let shading = Shading::of(options, &name);
+        let shading = Shading::new(options.falloff, options.bands.as_ref(), &name);
         let photograph = photograph
             .filter(|_| !is_hidden)
             .map(|decoded| self.photograph(decoded, mask.as_ref(), shading, split == Split::Train));

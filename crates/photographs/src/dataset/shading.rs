@@ -15,7 +15,6 @@ use nightsplat_core::camera::Camera;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::LoadOptions;
 use crate::image::{Image, linear_from_srgb, srgb_from_linear};
 
 /// Bands of rows of the photographs of a set, under lamps on mains.
@@ -42,15 +41,15 @@ impl Shading {
     const HIGHEST: f64 = 0.95;
 
     /// That of a view's photograph.
-    pub(super) fn of(options: &LoadOptions, view: &str) -> Self {
+    pub(super) fn new(falloff: Option<[f64; 2]>, bands: Option<&RowBands>, view: &str) -> Self {
         let wave = |bands: &RowBands| {
             let &[c, s] = bands.waves.get(view)?;
             let lower = (Self::HIGHEST / c.hypot(s)).min(1.0);
             (c != 0.0 || s != 0.0).then_some([bands.count, lower * c, lower * s])
         };
         Self {
-            falloff: options.falloff.unwrap_or_default(),
-            bands: options.bands.as_ref().and_then(wave).unwrap_or_default(),
+            falloff: falloff.unwrap_or_default(),
+            bands: bands.and_then(wave).unwrap_or_default(),
         }
     }
 

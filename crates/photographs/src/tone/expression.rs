@@ -42,7 +42,7 @@ const LARGEST_POWER: f64 = 64.0;
 #[derive(Clone, Debug)]
 pub struct Expression {
     formula: String,
-    root: Node,
+    root: FormulaNode,
     /// In the order of the formula. The default of one without a value is NaN.
     constants: Vec<Constant>,
 }
@@ -79,14 +79,14 @@ const FUNCTIONS: [(&str, Function, usize); 7] = [
 const VARIABLES: [&str; 2] = ["t", "x"];
 
 #[derive(Clone, Debug)]
-enum Node {
+enum FormulaNode {
     Number(f64),
     /// A variable or a constant, by its position among the names.
     Name(usize),
     Apply(Function, Vec<Self>),
 }
 
-impl Node {
+impl FormulaNode {
     /// A function of numbers is a number.
     fn apply(function: Function, arguments: Vec<Self>) -> Self {
         let is_number = arguments.iter().all(|node| matches!(node, Self::Number(_)));
@@ -139,17 +139,17 @@ impl Node {
 }
 
 /// Two operands and what is between them.
-fn two(function: Function, a: Node, b: Node) -> winnow::Result<Node> {
-    Ok(Node::apply(function, vec![a, b]))
+fn two(function: Function, a: FormulaNode, b: FormulaNode) -> winnow::Result<FormulaNode> {
+    Ok(FormulaNode::apply(function, vec![a, b]))
 }
 
 /// The rest of a formula, and the names that it contains.
 type Text<'a> = Stateful<&'a str, &'a RefCell<Vec<String>>>;
 
-fn formula(text: &mut Text<'_>) -> winnow::Result<Node> {
+fn formula(text: &mut Text<'_>) -> winnow::Result<FormulaNode> {
     expression(delimited(multispace0, operand, multispace0))
         .prefix(dispatch! {preceded(multispace0, any);
-            '-' => Prefix(8, |_: &mut _, a| Ok(Node::apply(Function::Minus, vec![a]))),
+            '-' => Prefix(8, |_: &mut _, a| Ok(FormulaNode::apply(Function::Minus, vec![a]))),
             _ => fail,
         })
         .infix(dispatch! {any;
@@ -163,8 +163,9 @@ fn formula(text: &mut Text<'_>) -> winnow::Result<Node> {
         .parse_next(text)
 }
 
-fn operand(text: &mut Text<'_>) -> winnow::Result<Node> {
-    alt((delimited('(', formula, ')'), called, named, float.map(Node::Number))).parse_next(text)
+fn operand(text: &mut Text<'_>) -> winnow::Result<FormulaNode> {
+    alt((delimited('(', formula, ')'), called, named, float.map(FormulaNode::Number)))
+        .parse_next(text)
 }
 
 fn name<'a>(text: &mut Text<'a>) -> winnow::Result<&'a str> {
@@ -173,25 +174,25 @@ fn name<'a>(text: &mut Text<'a>) -> winnow::Result<&'a str> {
     (take_while(1.., letter), rest).take().parse_next(text)
 }
 
-fn called(text: &mut Text<'_>) -> winnow::Result<Node> {
+fn called(text: &mut Text<'_>) -> winnow::Result<FormulaNode> {
     let arguments = delimited('(', separated(1..=2, formula, ','), ')');
-    let call = |(name, arguments): (&str, Vec<Node>)| {
+    let call = |(name, arguments): (&str, Vec<FormulaNode>)| {
         let known = FUNCTIONS.iter().find(|(known, ..)| *known == name);
         let (_, function, _) = known.filter(|(.., count)| *count == arguments.len())?;
-        Some(Node::apply(*function, arguments))
+        Some(FormulaNode::apply(*function, arguments))
     };
     (name, arguments).verify_map(call).parse_next(text)
 }
 
-fn named(text: &mut Text<'_>) -> winnow::Result<Node> {
+fn named(text: &mut Text<'_>) -> winnow::Result<FormulaNode> {
     let is_function = |name: &&str| FUNCTIONS.iter().any(|(known, ..)| known == name);
     let name = name.verify(|name: &str| !is_function(&name)).parse_next(text)?;
     if name == "pi" {
-        return Ok(Node::Number(PI));
+        return Ok(FormulaNode::Number(PI));
     }
     let mut names = text.state.borrow_mut();
     let known = names.iter().position(|known| known == name);
-    Ok(Node::Name(known.unwrap_or_else(|| {
+    Ok(FormulaNode::Name(known.unwrap_or_else(|| {
         names.push(name.to_owned());
         names.len() - 1
     })))

@@ -29,8 +29,8 @@ const HOT: f64 = 0.05;
 /// The variance of rounding to 8 bits.
 const ROUNDING: f64 = 1.0 / (255.0 * 255.0 * 12.0);
 
-/// Cells of an image, row by row.
-struct Cells {
+/// The cells of an image, row by row.
+struct StillCells {
     columns: usize,
     rows: usize,
     /// Of a cell, pixels.
@@ -44,7 +44,7 @@ pub(super) fn still(planes: &[Vec<f32>], grid: &PixelGrid) -> Vec<usize> {
     }
     let side = grid.width.max(grid.height).div_ceil(CELLS).max(MIN_CELL);
     let [columns, rows] = [grid.width, grid.height].map(|length| length.div_ceil(side));
-    let cells = Cells { columns, rows, side };
+    let cells = StillCells { columns, rows, side };
     let ratios: Vec<f64> =
         (0..columns * rows).map(|cell| ratio(planes, &cells.pixels(cell, grid))).collect();
     let likely: Vec<bool> = ratios.iter().map(|&ratio| ratio > LIKELY).collect();
@@ -81,7 +81,7 @@ fn ratio(planes: &[Vec<f32>], pixels: &[usize]) -> f64 {
     (contrast - changes / count) / (changes + ROUNDING)
 }
 
-impl Cells {
+impl StillCells {
     fn pixels(&self, cell: usize, grid: &PixelGrid) -> Vec<usize> {
         let [x, y] = [cell % self.columns, cell / self.columns].map(|at| at * self.side);
         let rows = y..(y + self.side).min(grid.height);
