@@ -248,7 +248,7 @@ fn a_model_that_is_refused_names_its_remedy() {
     for (name, bytes, parts) in [
         ("cut.ply", whole[..whole.len() - 3].to_vec(), ["is truncated", again]),
         ("list.ply", changed("float x", "list uchar float x"), ["list property", again]),
-        ("double.ply", changed("float x", "double x"), ["double, not float", again]),
+        ("int.ply", changed("float x", "int x"), ["of type int, not float", again]),
         ("near.ply", changed("near ", "near -"), ["states near", again]),
         ("a.spz", vec![0x1F, 0x8B, 0], ["cannot be unpacked", again]),
         ("a.sog", b"PK\x03\x04".to_vec(), ["is not a SOG", again]),
@@ -268,8 +268,10 @@ fn a_model_that_is_refused_names_its_remedy() {
     let long = format!("edit {} --up 0,-1,0 --out x.ply", path("long.ply").display());
     refused(&long, 3, &["long.ply", "neither PLY, SPZ nor SOG"]);
     fs::write(path("scan.zip"), "PK").unwrap();
-    let init = format!("--steps 1 --init {}/model.ply", path("scan.zip").display());
-    refuses_to_train(Path::new(&fixture().set()), &init, 3, &["is within", "scan.zip; extract it"]);
+    let [zip, out] = ["scan.zip", "run"].map(|name| path(name).display().to_string());
+    let train = format!("train {} --out {out} --steps 1 --plan none", fixture().set());
+    let (_, stderr) = run(&format!("{train} --init {zip}/model.ply"), 3);
+    assert!(stderr.contains("model.ply: is within") && stderr.contains("extract it"), "{stderr}");
 }
 
 #[test]

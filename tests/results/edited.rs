@@ -80,10 +80,11 @@ fn a_bright_model_of_unknown_targets_is_not_scored_against_dark_photographs() {
         succeed(&format!("{command} {bare} --dataset {set} --photographs"));
     }
     // A model as dark as the photographs is scored against them.
-    succeed(&workspace.train("plain", "--steps 40 --set tone.curve=none"));
-    let plain = ply::load(workspace.path("plain/model.ply")).unwrap();
-    ply::save(&plain, workspace.path("plain.ply")).unwrap();
-    succeed(&format!("eval {} --dataset {set}", path("plain.ply")));
+    let mut night = trained.with_sh_degree(0);
+    let color = 0.282_095;
+    night.dc_mut().iter_mut().for_each(|dc| *dc = ((*dc * color + 0.5) * 0.1 - 0.5) / color);
+    ply::save(&night, workspace.path("night.ply")).unwrap();
+    succeed(&format!("eval {} --dataset {set}", path("night.ply")));
     fs::write(workspace.path("page.html"), "<!DOCTYPE html>").unwrap();
     refused(&format!("export {} --format html", path("page.html")), 3, &["is a page, not a model"]);
 }
@@ -118,7 +119,7 @@ fn an_edit_of_a_run_says_what_it_costs_and_warns_of_a_loss() {
     };
     let (stdout, message) = edit("--rotate y:90 --opacity-min 0.0001");
     let [before, after] = before_and_after(&stdout);
-    assert!((before - psnr(&of_run)).abs() < 2e-3 && (after - before).abs() < 0.1, "{stdout}");
+    assert!((before - psnr(&of_run)).abs() < 0.02 && (after - before).abs() < 0.1, "{stdout}");
     assert!(stdout.contains("test views against their pseudo-GT: "), "{stdout}");
     assert!(!message.contains("loses"), "{message}");
     assert!(

@@ -66,7 +66,8 @@ impl Disk {
 
 #[test]
 fn files_are_on_the_disk_before_what_relies_on_them() {
-    let is_there = Command::new("strace").args(["-o", "/dev/null", "true"]).status();
+    let is_there =
+        Command::new("strace").args(["-f", "--seccomp-bpf", "-o", "/dev/null", "true"]).status();
     if !is_there.is_ok_and(|status| status.success()) {
         return not_run("strace", "strace is absent or may not trace");
     }

@@ -392,7 +392,9 @@ mod tests {
             antialiased: true,
             linear: None,
             law: SceneLaw::parse("auto 4.25 0.0125 0.075 1 1 0.333"),
-            targets: Some(r#"{"curve":"auto"}"#.to_owned()),
+            targets: Some(
+                r#"{"downscale":4.0,"exclude":["a\u0020b"],"tone.curve":"auto"}"#.to_owned(),
+            ),
             origin: model.origin,
         };
         let provenance = Provenance { facts: facts.clone(), ..Provenance::default() };

@@ -101,7 +101,8 @@ impl ModelFacts {
             "antialiased" => self.antialiased = flag(key, value)?,
             "linear" => self.linear = Some(number(key, value, "of stops", |_| true)?),
             "law" => self.law = Some(law(value)?),
-            "targets" => self.targets = Some(value.trim().to_owned()),
+            // A reader of JSON has resolved the blanks within names.
+            "targets" => self.targets = Some(value.trim().replace(' ', "\\u0020")),
             "origin" => self.origin = origin(value)?,
             _ => {}
         }

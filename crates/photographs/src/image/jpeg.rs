@@ -256,7 +256,7 @@ mod tests {
         let whole = fixture("420.jpg");
         let size = |bytes: &[u8]| size(&mut std::io::Cursor::new(bytes));
         assert_eq!(size(&whole), Some((37, 29)));
-        let long = [&[0xFF, 0xE1, 0xFF, 0xFF][..], &[0; 65_533]].concat().repeat(20);
+        let long = [&[0xFF_u8, 0xE1, 0xFF, 0xFF][..], &[0; 65_533]].concat().repeat(20);
         assert_eq!(size(&[&whole[..2], &long, &whole[2..]].concat()), Some((37, 29)));
         assert_eq!(size(&[&whole[..2], &[0; 70_000], &whole[2..]].concat()), None);
         let scan = whole.windows(2).position(|marker| marker == [0xFF, 0xDA]).unwrap();
