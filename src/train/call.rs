@@ -61,6 +61,11 @@ impl Call {
         *self = Self { budget, longest, scores, ..Self::default() };
     }
 
+    /// What these scores were for is decided: the next ones are of another model.
+    pub(super) fn decided(&mut self, what: Scored) {
+        self.scores.remove(&what);
+    }
+
     /// All that was due is done.
     pub(super) fn settle(&mut self) {
         self.scores.clear();

@@ -39,8 +39,8 @@ use crate::{Error, Result};
 use geometry::SceneGeometry;
 pub(super) use geometry::exposures_at_points;
 pub(crate) use geometry::median;
-use lamp::LampObservations;
 pub use lamp::{LampDiagnosis, bands::BandsDiagnosis, falloff::FalloffDiagnosis};
+use lamp::{LampObservations, shading};
 pub use noise::ChannelNoise;
 use photograph::PhotographStatistics;
 pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
@@ -261,19 +261,16 @@ impl Diagnosis {
         let (mut remarks, odd) = remarks(&diagnosed, &photographs, &views, &without_pose);
         let names: Vec<&str> = views.iter().map(|(_, view)| view.name.as_str()).collect();
         let tracks = LampObservations::new(&shared.observations, views.len());
-        let bands = tracks.as_ref().ok().map(|tracks| BandsDiagnosis::new(tracks, &names));
-        let (bands, in_tracks) = bands.unzip();
-        let tracks = tracks.map(|tracks| tracks.without(&in_tracks.unwrap_or_default()));
+        let shading = tracks.map(|tracks| shading(tracks, &names, shared.corner));
         remarks.extend(findings(&measured, Some(&exposure), 0.0));
         let mut scene = SceneDiagnosis::new(
             &diagnosed,
             photographs,
             &shared,
-            tracks,
+            shading,
             &exposure,
             dataset.points.len(),
         );
-        scene.bands = bands;
         scene.brought_near_white = brought_near_white(&measured, &exposure);
         // A pixel of a resized target averages this many pixels in each direction.
         let shrink = diagnosed.iter().zip(&views).map(|(view, (_, of))| {
@@ -398,7 +395,7 @@ impl SceneDiagnosis {
         views: &[ViewDiagnosis],
         photographs: Vec<PhotographStatistics>,
         shared: &SceneGeometry,
-        tracks: Result<LampObservations, String>,
+        shading: Result<(FalloffDiagnosis, BandsDiagnosis, LampObservations), String>,
         exposure: &Exposure,
         points: usize,
     ) -> Self {
@@ -408,8 +405,9 @@ impl SceneDiagnosis {
         let mean = |of: fn(&ViewDiagnosis) -> f64| {
             lit.iter().map(|view| of(view)).sum::<f64>() / lit.len().max(1) as f64
         };
-        let lamp = tracks.as_ref().map_err(Clone::clone).and_then(LampDiagnosis::new);
-        let falloff = tracks.ok().map(|tracks| FalloffDiagnosis::new(&tracks, shared.corner));
+        let tracks = shading.as_ref().map(|(.., tracks)| tracks).map_err(Clone::clone);
+        let lamp = tracks.and_then(LampDiagnosis::new);
+        let (falloff, bands) = shading.ok().map(|(falloff, bands, _)| (falloff, bands)).unzip();
         let is_lamp = lamp.as_ref().is_ok_and(LampDiagnosis::is_found);
         let measured = deviation(lit.iter().filter_map(|view| view.exposure));
         let light = mean(|view| view.light);
@@ -442,7 +440,7 @@ impl SceneDiagnosis {
             lamp: lamp.ok(),
             // A lamp's light falls as well.
             falloff: falloff.filter(|_| !is_lamp),
-            bands: None,
+            bands,
         }
     }
 }

@@ -113,7 +113,10 @@ mod tests {
             },
             ..TrainConfig::default()
         };
-        assert_eq!(config.difference(&other).unwrap(), "model.depth_folder (--depth) = nothing, not \"d\"");
+        assert_eq!(
+            config.difference(&other).unwrap(),
+            "model.depth_folder (--depth) = nothing, not \"d\""
+        );
     }
 
     #[test]

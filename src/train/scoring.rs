@@ -42,6 +42,7 @@ impl Trainer {
         let renders = renders(model, networks, clock.sh_degree(step));
         let part = (&mut clock.submissions.call, Scored::Model);
         let scores = held_out.mean_psnr_and_detail(part, &affines, renders)?;
+        clock.submissions.call.decided(Scored::Model);
         let Some([psnr, detail]) = scores else { return Ok(()) };
         let [score, detail] = [1e3 * psnr, 1e6 * detail].map(|score| score.round() as i64);
         let score = HeldOutScore { step, score, detail };

@@ -6,7 +6,7 @@ use nightsplat_photographs::dataset::{
 };
 
 use super::geometry::SceneGeometry;
-use super::lamp::{LampObservations, bands::BandsDiagnosis, falloff::FalloffDiagnosis};
+use super::lamp::{LampObservations, shading};
 use crate::train::config::TrainConfig;
 
 /// Every third photograph is looked at, if there are as many as this: a point is seen by several of them.
@@ -39,8 +39,7 @@ pub(crate) fn remarks_at_points(config: &TrainConfig) -> Vec<String> {
         return vec![];
     };
     let names: Vec<&str> = views.iter().map(|(_, view)| view.name.as_str()).collect();
-    let (bands, in_tracks) = BandsDiagnosis::new(&tracks, &names);
-    let falloff = FalloffDiagnosis::new(&tracks.without(&in_tracks), shared.corner);
+    let (falloff, bands, _) = shading(tracks, &names, shared.corner);
     let rows = bands.is_found().then(|| bands.why());
     let corners = falloff.is_found().then(|| falloff.why());
     rows.into_iter().chain(corners).map(|why| why + "; `train` evens them out").collect()

@@ -4,6 +4,9 @@
 //! ```text
 //! log2 brightness(p, v) = albedo_p + exposure_v + C_v cos(2 pi n y) + S_v sin(2 pi n y)
 //! ```
+//!
+//! What all photographs have in common is no band but a lens or a beam: only how far waves are from their mean shows
+//! bands.
 
 use std::f64::consts::{LN_2, TAU};
 
@@ -22,8 +25,8 @@ const MIN_POINTS: usize = 30;
 const MIN_SHARE: f64 = 0.2;
 /// The smallest difference between bright and dark rows, stops.
 const MIN_STOPS: f64 = 0.3;
-/// Rounds in which bands and the brightness of points are fitted in turn.
-const ROUNDS: usize = 12;
+/// Rounds in which bands and the brightness of points are fitted in turn: points take a part of the bands at first.
+const ROUNDS: usize = 40;
 
 /// Bands of rows as points show them.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -40,10 +43,11 @@ pub struct BandsDiagnosis {
 
 impl BandsDiagnosis {
     /// Measures observations of views with these names; also returns the bands in each observation, stops.
-    pub(in super::super) fn new(rows: &LampObservations, names: &[&str]) -> (Self, Vec<f64>) {
+    pub(super) fn new(rows: &LampObservations, names: &[&str]) -> (Self, Vec<f64>) {
         let (left, weights) = rows.left_by_exposures(None);
-        let share =
-            |count: f64| rows.share_of(&rows.waves(&left, &weights, count), &left, &weights);
+        let share = |count: f64| {
+            rows.share_of(&rows.waves(&left, &weights, count).about_mean(), &left, &weights)
+        };
         let best = |counts: &mut dyn Iterator<Item = f64>| {
             let shares = counts.map(|count| (share(count), count));
             shares.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default()
@@ -104,6 +108,20 @@ fn of_light(wave: [f64; 2]) -> [f64; 2] {
 struct Waves {
     count: f64,
     of_view: Vec<[f64; 2]>,
+}
+
+impl Waves {
+    /// Less the mean of the views that have a wave.
+    fn about_mean(mut self) -> Self {
+        let has_wave = |wave: &&mut [f64; 2]| **wave != [0.0; 2];
+        let waves: Vec<&mut [f64; 2]> = self.of_view.iter_mut().filter(has_wave).collect();
+        let count = waves.len().max(1) as f64;
+        let mean = [0, 1].map(|part| waves.iter().map(|wave| wave[part]).sum::<f64>() / count);
+        for wave in waves {
+            *wave = [wave[0] - mean[0], wave[1] - mean[1]];
+        }
+        self
+    }
 }
 
 impl LampObservations {

@@ -41,7 +41,7 @@ pub struct FalloffDiagnosis {
 
 impl FalloffDiagnosis {
     /// Measures observations; `corner` is u at the corner that is farthest from the axis.
-    pub(in super::super) fn new(rows: &LampObservations, corner: f64) -> Self {
+    pub(super) fn new(rows: &LampObservations, corner: f64) -> Self {
         let stops = |[first, second]: [f64; 2]| first * corner + second * corner * corner;
         let falloff = rows.fit_falloff();
         let measured = if (-stops(falloff)).exp2() < MAX_CORNER { FOLDS } else { 0 };
