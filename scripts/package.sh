@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Packs a built program for a release: scripts/package.sh TARGET BINARY writes dist/nightsplat-VERSION-TARGET.tar.gz
-# (.zip for Windows) with completions, man pages, the licences of all crates, and its checksum. GLIBC is the newest glibc
-# that the program may require (default: any); the required version is printed.
+# (.zip for Windows) with completions, man pages, the licences of all crates, and its checksum. GLIBC is the newest
+# glibc that the program may require (default: any); the required version is printed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 target=${1:?name the target, such as x86_64-unknown-linux-gnu}

@@ -8,8 +8,8 @@
 #   DIR/NOTES.md, DIR/SHA256SUMS             the changes of this version, the checksums
 #
 # Nothing is published: that is what .github/workflows/release.yml does, when a tag is pushed. The tree has to be clean,
-# and its commit to have the tag vVERSION; `--untagged` is for a rehearsal. NIGHTSPLAT_PROFILE=dev rehearses with what is
-# built already. The empty system comes from the first mirror of /etc/apt, or NIGHTSPLAT_MIRROR.
+# and its commit to have the tag vVERSION; `--untagged` is for a rehearsal. NIGHTSPLAT_PROFILE=dev rehearses with what
+# is built already. The empty system comes from the first mirror of /etc/apt, or NIGHTSPLAT_MIRROR.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

@@ -22,13 +22,15 @@ finish() {
 }
 trap finish EXIT
 
-mirror=${NIGHTSPLAT_MIRROR:-$(sed -nE 's/^(deb (\[[^]]*\] )?|URIs: )(https?:[^ ]+).*/\3/p' /etc/apt/sources.list /etc/apt/sources.list.d/* 2> /dev/null | head -1)}
+mirrors() { sed -nE 's/^(deb (\[[^]]*\] )?|URIs: )(https?:[^ ]+).*/\3/p' /etc/apt/sources.list{,.d/*} 2> /dev/null; }
+mirror=${NIGHTSPLAT_MIRROR:-$(mirrors | head -1)}
 empty=${KEEP:-$scratch/empty}
 # What any of the parts needs from the system: the loader and a device, and what builds a host in C.
 packages=libvulkan1,mesa-vulkan-drivers,libgcc-s1,gcc,libc6-dev,libvulkan-dev,pkg-config,cmake,make,python3,python3-venv
 if [ ! -e "$empty/etc/debian_version" ]; then
     echo "an empty Debian"
-    debootstrap --variant=minbase --include="$packages" bookworm "$empty" "$mirror" > "$scratch/debootstrap.log" 2>&1 || {
+    debootstrap --variant=minbase --include="$packages" bookworm "$empty" "$mirror" \
+        > "$scratch/debootstrap.log" 2>&1 || {
         tail -5 "$scratch/debootstrap.log"
         exec "$root/scripts/not-run.sh" debootstrap 'the mirror cannot be reached'
     }
@@ -43,7 +45,8 @@ fresh() {
 }
 # inside PART SCRIPT: runs it there, as a user would.
 inside() {
-    chroot "$scratch/$1" /usr/bin/env -i HOME=/root PATH=/usr/local/bin:/usr/bin:/bin NIGHTSPLAT_TUNE=off bash -euo pipefail -c "$2"
+    chroot "$scratch/$1" /usr/bin/env -i HOME=/root PATH=/usr/local/bin:/usr/bin:/bin NIGHTSPLAT_TUNE=off \
+        bash -euo pipefail -c "$2"
 }
 
 echo "the program"
@@ -70,7 +73,10 @@ inside c '
     printf "%s\n" "cmake_minimum_required(VERSION 3.20)" "project(host C)" "find_package(nightsplat REQUIRED)" \
         "find_package(Vulkan REQUIRED)" "add_executable(host embed.c)" \
         "target_link_libraries(host nightsplat::nightsplat Vulkan::Vulkan m)" > CMakeLists.txt
-    cmake -B build -DCMAKE_PREFIX_PATH=/opt/moved > /dev/null && cmake --build build > /dev/null && ./build/host model.ply again.ppm && cmp frame.ppm again.ppm'
+    cmake -B build -DCMAKE_PREFIX_PATH=/opt/moved > /dev/null
+    cmake --build build > /dev/null
+    ./build/host model.ply again.ppm
+    cmp frame.ppm again.ppm'
 
 if compgen -G "$release/*.whl" > /dev/null; then
     echo "the Python package"

@@ -1,5 +1,5 @@
-// The orthographic camera: focal * (x, y) + principal point, where focal is in pixels per world unit. Rays are parallel.
-// It has no gradients: no training view has this camera. Included by camera.glsl.
+// The orthographic camera: focal * (x, y) + principal point, where focal is in pixels per world unit. Rays are
+// parallel. It has no gradients: no training view has this camera. Included by camera.glsl.
 
 vec2 orthographic_project(vec3 point, Camera camera) { return camera.focal * point.xy + camera.principal_point; }
 

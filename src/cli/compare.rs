@@ -15,8 +15,9 @@ use crate::results::comparison::{CompareOptions, NamedRenders, RunComparison};
 /// Compare runs or models on the test views of one dataset.
 ///
 /// Renders the test views of each and scores them against the same images: the references or, without any, the targets
-/// of the first run; a model file states the tone curve and the size of its run. Prints a row per run and, for every view, the PSNR of the first run and the gains of the others.
-/// The page adds the settings that differ, and renders side by side, the most different views first.
+/// of the first run; a model file states the tone curve and the size of its run. Prints a row per run and, for every
+/// view, the PSNR of the first run and the gains of the others. The page adds the settings that differ, and renders
+/// side by side, the most different views first.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct CompareArgs {

@@ -30,10 +30,11 @@ use crate::train::{Preset, RequestedSettings, diagnosed};
 ///
 /// Begins with a verdict and the photographs that need attention. -v adds all measurements and what is off.
 ///
-/// Columns of the table of -v: p10, p90, mean and cubic mean of the encoded luminance; r = p10 / p90; EV: stops above the
-/// other views of the same points; white and black: values near white (0.94 and above) and zero values; codes: distinct
-/// values; luma and chroma noise: standard deviations in the target, after the tone curve, with JPEG and quantisation
-/// noise; blur: width of edges, pixels; points: visible points; overlap: share of the view that other views see.
+/// Columns of the table of -v: p10, p90, mean and cubic mean of the encoded luminance; r = p10 / p90; EV: stops above
+/// the other views of the same points; white and black: values near white (0.94 and above) and zero values; codes:
+/// distinct values; luma and chroma noise: standard deviations in the target, after the tone curve, with JPEG and
+/// quantisation noise; blur: width of edges, pixels; points: visible points; overlap: share of the view that other
+/// views see.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct DiagnoseArgs {

@@ -76,12 +76,13 @@ pub fn run(args: &EditArgs) -> Result<()> {
     if let (Some(list), Some(path)) = (&list, &args.edits) {
         editor.check_list(path, list)?;
     }
+    let mut unscored = None;
     let listed = list.iter().flat_map(|list| &list.edits);
     for operation in listed.chain(args.operations.iter()) {
         if operation.changes_renders()
             && let Err(reason) = editor.score_before()
         {
-            tracing::warn!("the edit is not scored: {reason}");
+            unscored = Some(reason);
         }
         let bar = progress_bar(0);
         let told = Cell::new(Instant::now());
@@ -95,6 +96,9 @@ pub fn run(args: &EditArgs) -> Result<()> {
         });
         bar.finish_and_clear();
         tell(one_line(&line?));
+    }
+    if let Some(reason) = unscored {
+        tracing::warn!("the edit is not scored: {reason}");
     }
     if let Some(EditScore { before, after, against }) = editor.score()? {
         tell(format!(

@@ -80,9 +80,9 @@ const EXAMPLES: &str = "Examples:
   nightsplat export run --format html             run/model.html: a viewer with photographs
   nightsplat export run --format html --max-size 8M --title 'Our attic'
   nightsplat export run --format spz --out a.spz  a tenth of the size, eight bits per number
-  nightsplat export run --format glb              glTF with KHR_gaussian_splatting, at full precision
-  nightsplat export run --format usda             OpenUSD 26.03, at full precision, as text; usdz is its package
-  nightsplat export run --format streamed-sog     run/model.streamed-sog: levels of detail, for large scenes";
+  nightsplat export run --format glb              glTF: KHR_gaussian_splatting
+  nightsplat export run --format usda             OpenUSD 26.03; usdz is its package
+  nightsplat export run --format streamed-sog     chunks and levels, for large scenes";
 
 /// Writes the file.
 pub fn run(args: &ExportArgs) -> Result<()> {

@@ -15,8 +15,8 @@ use crate::{Error, Result, Stop};
 /// this time of the first is no second one.
 const SAME_WITHIN: Duration = Duration::from_secs(1);
 
-/// Has a file beyond the limit of its size (`ulimit -f`) be an error of writing, with its path, instead of the end of the
-/// process.
+/// Has a file beyond the limit of its size (`ulimit -f`) be an error of writing, with its path, instead of the end of
+/// the process.
 pub fn report_long_files() {
     // Without a handler it is as it was.
     #[cfg(unix)]

@@ -33,8 +33,8 @@ pub enum Tolerance {
     },
     /// Two 16-bit floats in a word, each equal to the reference's or adjacent to it.
     Halves,
-    /// Numbers without sign in a word, of these widths from the lowest bit on, each equal to the reference's or adjacent
-    /// to it.
+    /// Numbers without sign in a word, of these widths from the lowest bit on, each equal to the reference's or
+    /// adjacent to it.
     Fields(&'static [u32]),
     /// One partial sum per workgroup, of which only the total counts: the device chooses the partition.
     Sum(f64),

@@ -15,8 +15,8 @@ use crate::train::diagnose::{
     is_blurred, median,
 };
 
-/// A column of the table of photographs: name, decimals, meaning with its unit, bad values in words, and whether a value
-/// is bad, given the median of the column.
+/// A column of the table of photographs: name, decimals, meaning with its unit, bad values in words, and whether a
+/// value is bad, given the median of the column.
 type Measure = (&'static str, usize, &'static str, &'static str, fn(f64, f64) -> bool);
 
 /// The columns, in the order of [`values`].

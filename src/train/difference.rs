@@ -33,9 +33,10 @@ const FREE: [&str; 17] = [
 ];
 
 impl TrainConfig {
-    /// The first setting that differs from `other`'s, with both values: `tone.alpha = 0.1, not 0.12`; the curve before its constants. Settings that
-    /// change no step beyond rounding do not count: the number of steps, paths, scoring and saving, device and tiles.
-    /// Nor does a lower limit of the Gaussians, so that a run that ran out of memory can resume.
+    /// The first setting that differs from `other`'s, with both values: `tone.alpha = 0.1, not 0.12`; the curve before
+    /// its constants. Settings that change no step beyond rounding do not count: the number of steps, paths, scoring
+    /// and saving, device and tiles. Nor does a lower limit of the Gaussians, so that a run that ran out of memory can
+    /// resume.
     pub(crate) fn difference(&self, other: &Self) -> Option<String> {
         const ALSO: [&str; 6] =
             ["steps", "reference", "stop.every", "stop.gain", "stop.detail_gain", "stop.margin"];

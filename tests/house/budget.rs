@@ -89,7 +89,8 @@ fn the_tree_keeps_within_its_budget_and_the_budget_close_to_the_tree() {
     assert!(broken.is_empty(), "{broken}The table of {} for this tree:\n{table}", file!());
 }
 
-/// The largest file of the repository, in bytes: what is larger is data or was built, and stays in its history for ever.
+/// The largest file of the repository, in bytes: what is larger is data or was built, and stays in its history for
+/// ever.
 const MAX_BYTES: u64 = 512 << 10;
 
 #[test]

@@ -30,8 +30,8 @@ fn scores_equal_those_of_a_plain_two_dimensional_convolution() {
 
 #[test]
 fn the_uniform_window_is_that_of_scikit_image() {
-    // From `skimage.metrics.structural_similarity(render, reference, data_range=1.0, channel_axis=2)`, version 0.25, and
-    // from a direct sum over the 7x7 windows; both agree to the last digit but one.
+    // From `skimage.metrics.structural_similarity(render, reference, data_range=1.0, channel_axis=2)`, version 0.25,
+    // and from a direct sum over the 7x7 windows; both agree to the last digit but one.
     let (render, reference) = pattern(13, 9);
     let ssim = ssim_uniform(&render, &reference).unwrap();
     assert!((ssim - 0.943_783_204_921_622_5).abs() < 1e-9, "{ssim}");

@@ -69,8 +69,8 @@ pub(super) fn affine(m: &[f64; 12]) -> DAffine3 {
 
 /// The camera of an engine's column-major view and projection matrices, for Vulkan's clip space (x right, y down,
 /// depth 0 to 1, or reversed). The camera may look along z or -z, with y up or down. `width` and `height` are those of
-/// the viewport in pixels. An orthographic projection gives an orthographic camera, which looks along the axis that makes
-/// its image no mirror of the world.
+/// the viewport in pixels. An orthographic projection gives an orthographic camera, which looks along the axis that
+/// makes its image no mirror of the world.
 ///
 /// Errors: `NSP_ERROR_USAGE` if the projection is sheared, or if the matrices scale or mirror the world.
 ///

@@ -71,8 +71,8 @@ struct User(*mut c_void);
 unsafe impl Send for User {}
 
 /// Creates a watch. `progress` is called with a stage, such as "decoding photographs" or "training", how much of it is
-/// done, and all of it: from any thread, by one at a time. It may call `nsp_watch_stop`, and nothing else of the library.
-/// NULL: progress is not told.
+/// done, and all of it: from any thread, by one at a time. It may call `nsp_watch_stop`, and nothing else of the
+/// library. NULL: progress is not told.
 ///
 /// # Safety
 /// `progress` may be called with `user` as long as the watch or a trainer with it lives; `watch` is NULL or valid.
@@ -101,9 +101,9 @@ pub unsafe extern "C" fn nsp_watch_create(
     })
 }
 
-/// Stops the call of a trainer that is running with the watch, or the next: it returns `NSP_ERROR_STOPPED`, after a call
-/// that reports the steps done so far where there are any. The trainer can go on afterwards. May be called from any
-/// thread.
+/// Stops the call of a trainer that is running with the watch, or the next: it returns `NSP_ERROR_STOPPED`, after a
+/// call that reports the steps done so far where there are any. The trainer can go on afterwards. May be called from
+/// any thread.
 ///
 /// # Safety
 /// `watch` is NULL or valid.
@@ -127,8 +127,8 @@ pub unsafe extern "C" fn nsp_watch_destroy(watch: *mut NspWatch) {
 }
 
 /// Creates a trainer for the dataset in a folder. `config_toml` is text in the format of config.toml; NULL or empty:
-/// the settings follow from the photographs. `watch` follows this call and the training; NULL: none. The device must not
-/// be record-only.
+/// the settings follow from the photographs. `watch` follows this call and the training; NULL: none. The device must
+/// not be record-only.
 ///
 /// # Safety
 /// The texts are NULL or end with NUL; the pointers are NULL or valid.

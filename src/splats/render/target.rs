@@ -28,8 +28,8 @@ pub struct Target<'a> {
     pub depth: Option<&'a HostImage>,
     /// The kind of depth in `depth`.
     pub depth_kind: DepthKind,
-    /// The meaning of the values of `depth`; [`DepthConvention::Linear`] is infinite where there is no splat, others are
-    /// at the far plane.
+    /// The meaning of the values of `depth`; [`DepthConvention::Linear`] is infinite where there is no splat, others
+    /// are at the far plane.
     pub depth_convention: DepthConvention,
     /// The host's depth buffer, which occludes splats.
     pub scene: Option<SceneDepth<'a>>,
@@ -47,8 +47,8 @@ pub struct Target<'a> {
     pub hdr10_nits: Option<f32>,
     /// Where each pixel's point was in the frame before.
     pub motion: Option<Motion<'a>>,
-    /// A pixel of the first camera, column and row, of which [`Renderer::picked`](crate::Renderer::picked) tells what is
-    /// there once the frame is done.
+    /// A pixel of the first camera, column and row, of which [`Renderer::picked`](crate::Renderer::picked) tells what
+    /// is there once the frame is done.
     pub pick: Option<[u32; 2]>,
     /// The most intersections of splats and tiles, of which the farthest are left out first; 0: as memory allows.
     pub budget: u32,
@@ -76,13 +76,14 @@ impl Default for Target<'_> {
 
 /// Motion vectors: from each pixel to where its point was seen in the frame before, in pixels, x right and y down. The
 /// point is at the depth of [`Target::depth_kind`], and moves with the camera and with the instance of the Gaussian at
-/// which half of the light is blocked ([`Instance::before`](crate::Instance::before)); infinitely far where no splat is.
+/// which half of the light is blocked ([`Instance::before`](crate::Instance::before)); infinitely far where no splat
+/// is.
 #[derive(Clone, Copy, Debug)]
 pub struct Motion<'a> {
     /// RG16F or RG32F.
     pub image: &'a HostImage,
-    /// The cameras of the frame before, one for each of the draw's and of its size: pinholes, or orthographic both. With
-    /// the principal point of this frame's, a jitter is left out.
+    /// The cameras of the frame before, one for each of the draw's and of its size: pinholes, or orthographic both.
+    /// With the principal point of this frame's, a jitter is left out.
     pub before: &'a [Camera],
 }
 

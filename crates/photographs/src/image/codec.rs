@@ -32,8 +32,8 @@ fn is_of_read_format(start: &[u8]) -> bool {
     is_webp || begins.iter().any(|magic| start.starts_with(magic))
 }
 
-/// The bytes of a file. What declares too much is refused by its header; of what is no image only the beginning is read,
-/// by which decoders refuse it, however long it is.
+/// The bytes of a file. What declares too much is refused by its header; of what is no image only the beginning is
+/// read, by which decoders refuse it, however long it is.
 fn bytes_of_image(path: &Path) -> Result<Vec<u8>> {
     let Some(Ok(mut header)) = tree::open_header(path, START) else { return tree::bytes(path) };
     let mut start = vec![];

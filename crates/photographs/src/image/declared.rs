@@ -7,14 +7,14 @@ use nightsplat_core::input::unreadable;
 use nightsplat_core::{Error, Result};
 
 use super::budget::MAX_PIXELS;
-use super::decode::undecodable;
 use super::exr_file;
-use super::source::{BufReadSeek, not_an_image, reader};
+use super::source::{BufReadSeek, not_an_image, reader, undecodable};
 use super::{jpeg, png_file};
 
 /// The limit for the samples of all layers of an EXR file, which are decoded at once, bytes.
 const MAX_BYTES: u64 = 1 << 33;
-/// The limit for the bytes of a file beyond those of its decoded pixels: layers and previews of editors, clips of phones.
+/// The limit for the bytes of a file beyond those of its decoded pixels: layers and previews of editors, clips of
+/// phones.
 const MAX_MORE: u64 = 1 << 30;
 
 /// The declared number of pixels of a file, which is within the limits, as is its length; 0 if its header is not

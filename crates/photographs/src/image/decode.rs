@@ -3,7 +3,6 @@
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use ::image::error::UnsupportedErrorKind;
 use ::image::{DynamicImage, ImageError};
 use nightsplat_core::{Error, Result};
 
@@ -15,7 +14,7 @@ use super::files::RAW_REMEDY;
 use super::files::{CONVERTIBLE, is_raw};
 use super::levels::{Levels, SampleFormat};
 use super::rows::{Destination, RowObserver, Rows};
-use super::source::{not_an_image, reader};
+use super::source::{reader, undecodable};
 use super::{Image, declared, exr_file, jpeg, png_file};
 
 /// An image file, read whole.
@@ -183,24 +182,6 @@ fn refuse_convertible(path: &Path, bytes: &[u8]) -> Result<()> {
     };
     let remedy = CONVERTIBLE.iter().find(|(name, ..)| *name == kind).map(|(.., remedy)| remedy);
     Err(Error::input(path, format!("is {kind}; {}", remedy.unwrap_or(&"convert it first"))))
-}
-
-/// Distinguishes damaged files from unsupported ones, such as a TIFF of floats, which may or may not be linear light.
-pub(super) fn undecodable(path: &Path, error: &ImageError) -> Error {
-    match error {
-        ImageError::Unsupported(kind)
-            if !matches!(kind.kind(), UnsupportedErrorKind::Format(_)) =>
-        {
-            let problem =
-                format!("is not read ({kind}); save it with 8 or 16 bits, or linear light as EXR");
-            Error::input(path, problem)
-        }
-        ImageError::Limits(limit) => Error::input(
-            path,
-            format!("needs more memory than decoders may take ({limit}); crop or shrink it"),
-        ),
-        damage => not_an_image(path, damage),
-    }
 }
 
 #[cfg(feature = "raw")]

@@ -3,7 +3,8 @@
 use std::io::{BufRead, Seek};
 use std::path::Path;
 
-use ::image::ImageReader;
+use ::image::error::UnsupportedErrorKind;
+use ::image::{ImageError, ImageReader};
 use nightsplat_core::Error;
 
 /// A file or memory as one type: decoders are compiled for each type that they read from.
@@ -25,4 +26,22 @@ pub(super) fn not_an_image(path: &Path, error: &dyn std::error::Error) -> Error 
         "is not a readable PNG, JPEG, WebP, TIFF or EXR image ({error}); replace or remove it"
     );
     Error::input(path, problem)
+}
+
+/// Distinguishes damaged files from unsupported ones, such as a TIFF of floats, which may or may not be linear light.
+pub(super) fn undecodable(path: &Path, error: &ImageError) -> Error {
+    match error {
+        ImageError::Unsupported(kind)
+            if !matches!(kind.kind(), UnsupportedErrorKind::Format(_)) =>
+        {
+            let problem =
+                format!("is not read ({kind}); save it with 8 or 16 bits, or linear light as EXR");
+            Error::input(path, problem)
+        }
+        ImageError::Limits(limit) => Error::input(
+            path,
+            format!("needs more memory than decoders may take ({limit}); crop or shrink it"),
+        ),
+        damage => not_an_image(path, damage),
+    }
 }
