@@ -7,6 +7,7 @@ use nightsplat_core::output::{one_line, write_whole};
 use nightsplat_photographs::tree::check_writable;
 
 use super::eval::LpipsRange;
+use super::tell::wrapped;
 use super::{finish, opener, print, word};
 use crate::Error;
 use crate::gpu::DeviceChoice;
@@ -86,11 +87,17 @@ pub fn run(args: &CompareArgs) -> Result<()> {
         print(one_line(&format!("{key}: {values}")))?;
     }
     if let Some(label) = comparison.label() {
-        print(label)?;
+        print(wrapped(&label, 0))?;
     }
     let next = match &args.report {
         Some(path) => format!("open {} in a browser", word(path)),
-        None => "nightsplat compare ... --report compare.html".to_owned(),
+        None => {
+            let runs: Vec<String> = args.runs.iter().map(|run| word(run)).collect();
+            let dataset =
+                args.dataset.as_ref().map(|folder| format!(" --dataset {}", word(folder)));
+            let dataset = dataset.unwrap_or_default();
+            format!("nightsplat compare {}{dataset} --report compare.html", runs.join(" "))
+        }
     };
     finish(&wrote, &next);
     Ok(())
