@@ -140,8 +140,11 @@ fn training_seconds(input: &Path, config: &TrainConfig, is_cpu: bool) -> f64 {
     const PIXELS: f64 = 250.0 * 188.0;
     /// Of the most steps of a run that ends when it has converged.
     const USUAL: f64 = 0.5;
-    let files = photographs_in(input).or_else(|_| photographs_in(&input.join("images")));
-    let first = files.ok().and_then(|files| Image::size_of(files.first()?).ok());
+    let first = match Dataset::listed(input, &config.load_options()) {
+        Ok((listed, ..)) => listed.into_iter().next().map(|photograph| photograph.input),
+        Err(_) => photographs_in(input).unwrap_or_default().into_iter().next(),
+    };
+    let first = first.and_then(|first| Image::size_of(first).ok());
     let size: [f64; 2] =
         first.map_or([1600.0, 1200.0], |(width, height)| [width.into(), height.into()]);
     let most = match config.max_resolution {
