@@ -5,8 +5,8 @@
 #   DIR/lib/libnightsplat.so -> libnightsplat.so.0, and libnightsplat.a
 #   DIR/lib/pkgconfig/nightsplat.pc, DIR/lib/cmake/nightsplat/nightsplat-config.cmake
 #
-# Without options it is a renderer; `--features train` adds training and the formats beside PLY. From a checkout the
-# kernels are compiled, which needs C++; an archive holds them compiled.
+# DIR may be moved. Without options it is a renderer; `--features train` adds training and the formats beside PLY. From
+# a checkout the kernels are compiled, which needs C++; an archive holds them compiled.
 set -euo pipefail
 
 [ $# -ge 1 ] || {
@@ -45,7 +45,7 @@ if [ "$profile" = release ]; then
     install -m 644 "$built/libnightsplat_capi.a" "$out/lib/libnightsplat.a"
 fi
 install -m 644 crates/capi/src/nightsplat.h "$out/include/nightsplat.h"
-fill() { sed -e "s|@VERSION@|$version|; s|@PREFIX@|$out|; s|@ABI@|$abi|" "$1" > "$2"; }
+fill() { sed -e "s|@VERSION@|$version|; s|@ABI@|$abi|" "$1" > "$2"; }
 fill crates/capi/src/nightsplat.pc.in "$out/lib/pkgconfig/nightsplat.pc"
 fill crates/capi/src/nightsplat-config.cmake.in "$out/lib/cmake/nightsplat/nightsplat-config.cmake"
 flags="PKG_CONFIG_PATH=$out/lib/pkgconfig pkg-config --cflags --libs nightsplat vulkan"

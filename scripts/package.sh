@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Packs a built program for a release: scripts/package.sh TARGET BINARY writes dist/nightsplat-VERSION-TARGET.tar.gz
-# (.zip for Windows) with completions, man pages and licences, and its checksum. GLIBC is the newest glibc that the
-# program may require (default: any); the required version is printed.
+# (.zip for Windows) with completions, man pages, the licences of all crates, and its checksum. GLIBC is the newest glibc
+# that the program may require (default: any); the required version is printed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 target=${1:?name the target, such as x86_64-unknown-linux-gnu}
@@ -16,6 +16,8 @@ cp "$binary" README.md CHANGELOG.md LICENSE-APACHE LICENSE-MIT "dist/$name/"
 case $target in
 *-linux-*) strip "dist/$name/${binary##*/}" ;;
 esac
+# Of the crates of this platform.
+scripts/licences.py --filter-platform "$target" > "dist/$name/LICENSES-THIRD-PARTY.txt"
 "$binary" man "dist/$name/man/man1"
 for shell in bash elvish fish powershell zsh; do
     "$binary" completions "$shell" > "dist/$name/completions/nightsplat.$shell"

@@ -7,6 +7,7 @@ use std::path::Path;
 use anyhow::Result;
 use clap::{FromArgMatches, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
+use nightsplat_core::output::in_a_line;
 pub use nightsplat_core::output::one_line;
 use nightsplat_core::settings::Setting;
 use nightsplat_photographs::image::{Image, ImageFile};
@@ -52,6 +53,7 @@ mod words;
 
 pub use hints::hint;
 pub use phases::Phases;
+pub use signals::report_long_files;
 pub use stopped::ending;
 pub use tell::tell_on_stderr;
 use tell::{print, tell};
@@ -77,7 +79,7 @@ const EXAMPLES: &str = "Start with:
   nightsplat eval run --save-images                 score it where there are references
   nightsplat compare run1 run2 --report page.html   runs side by side
   nightsplat render run --split all --out pictures  see the model from every camera
-  nightsplat export run --format html                   a page with the splat to fly through
+  nightsplat export run --format html               a page with the splat to fly through
   nightsplat view run                               the same while it trains, in a browser
   nightsplat edit run --floaters --out clean.ply    crop, clean, transform and merge models
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
@@ -146,9 +148,9 @@ impl Cli {
     /// Runs the command.
     pub fn run(self) -> Result<()> {
         match self.command {
-            Command::Make(args) => make::run(&args),
-            Command::Train(args) => train::run(&args),
-            Command::Diagnose(args) => diagnose::run(&args),
+            Command::Make(args) => make::run(&args, self.verbose > 0),
+            Command::Train(args) => train::run(&args, self.verbose > 0),
+            Command::Diagnose(args) => diagnose::run(&args, self.verbose > 0),
             Command::Pose(args) => pose::run(&args),
             Command::Eval(args) => eval::run(&args),
             Command::Compare(args) => compare::run(&args),
@@ -188,6 +190,12 @@ fn finish(wrote: &str, next: &str) {
     tell(format_args!("{wrote}next: {}", one_line(next)));
 }
 
+/// A run or a model as words of a command, with the dataset that was named for it.
+fn with_dataset(run: &Path, dataset: Option<&Path>) -> String {
+    let dataset = dataset.map(|dataset| format!(" --dataset {}", word(dataset)));
+    word(run) + &dataset.unwrap_or_default()
+}
+
 /// A path as a word of a command.
 fn word(path: &Path) -> String {
     quoted(&path.display().to_string())
@@ -206,7 +214,7 @@ fn quoted(word: &str) -> String {
 pub fn event_field(writer: &mut Writer<'_>, field: &Field, value: &dyn fmt::Debug) -> fmt::Result {
     let text = format!("{value:?}");
     match field.name() {
-        "message" => write!(writer, "{}", one_line(&text)),
+        "message" => write!(writer, "{}", in_a_line(&text)),
         name => write!(writer, "{name}={}", one_line(&text)),
     }
 }
@@ -296,9 +304,12 @@ mod tests {
             tracing_subscriber::registry().with(lines.clone()),
             || {
                 tracing::warn!("skipped {}", "no\nerror: lost\u{202e}.png");
+                tracing::warn!("skipped {}", "x".repeat(100_000));
             },
         );
-        assert_eq!(*lines.0.lock().unwrap(), r"skipped no\nerror: lost\u{202e}.png");
+        let lines = lines.0.lock().unwrap();
+        assert!(lines.starts_with(r"skipped no\nerror: lost\u{202e}.pngskipped xxx"), "{lines}");
+        assert!(lines.len() < 1100 && lines.ends_with("x ..."), "{lines}");
     }
 
     #[test]

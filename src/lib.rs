@@ -168,7 +168,10 @@ pub mod train;
 
 // Types of these crates are part of the API.
 #[doc(inline)]
-pub use nightsplat_core::{Error, Result, Stop};
+pub use nightsplat_core::{
+    Error, Result, Stop,
+    watch::{Progress, Watch},
+};
 
 pub use {ash, glam};
 
@@ -193,8 +196,8 @@ pub use splats::lamp::Lamp;
 pub use splats::model::Model;
 pub use splats::packed_sh::StorageFormat;
 pub use splats::render::{
-    Damping, DepthConvention, DepthKind, Drawn, Gradients, Instance, Purpose, RenderOptions,
-    RenderSettings, Renderer, SceneDepth, Status, Target, Viewpoint,
+    Damping, DepthConvention, DepthKind, Drawn, Gradients, Hit, Instance, Motion, Pick, Purpose,
+    RenderOptions, RenderSettings, Renderer, SceneDepth, Status, Target, Viewpoint,
 };
 pub use splats::scene::{DeviceGaussians, Features, GaussianSlice, Gaussians, Layout, Shape};
 
@@ -202,7 +205,7 @@ pub use splats::scene::{DeviceGaussians, Features, GaussianSlice, Gaussians, Lay
 #[cfg(feature = "train")]
 #[doc(inline)]
 pub use nightsplat_photographs::{
-    dataset::{Dataset, DepthOptions, LoadOptions, Original, Point, Split, View},
+    dataset::{Dataset, DepthOptions, LoadOptions, Original, Point, RowBands, Split, View},
     image::{ImageFile, Mask, Orientation},
     metrics::Scores,
     tone::{Profile, Table, Tone, ToneCurve, ToneSettings},

@@ -4,12 +4,15 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use nightsplat::Error;
-use nightsplat::cli::{Cli, Phases, ending, event_field, hint, one_line, tell_on_stderr};
+use nightsplat::cli::{
+    Cli, Phases, ending, event_field, hint, one_line, report_long_files, tell_on_stderr,
+};
 use tracing_subscriber::filter::{LevelFilter, filter_fn};
 use tracing_subscriber::fmt::format::debug_fn;
 use tracing_subscriber::prelude::*;
 
 fn main() -> ExitCode {
+    report_long_files();
     let cli = match Cli::read(std::env::args_os().collect()) {
         Ok(cli) => cli,
         Err(error) => return misuse(&error),
@@ -47,7 +50,13 @@ fn misuse(error: &clap::Error) -> ExitCode {
         ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand,
     ];
     if help.contains(&error.kind()) {
-        error.exit();
+        return match error.print() {
+            Err(problem) if problem.kind() != std::io::ErrorKind::BrokenPipe => {
+                tell_on_stderr(format_args!("error: help cannot be written ({problem})"));
+                ExitCode::from(1)
+            }
+            _ => ExitCode::from(error.exit_code() as u8),
+        };
     }
     let text = error.to_string();
     let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());

@@ -22,7 +22,7 @@ use crate::{Error, Result};
 
 /// A stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stage {
+pub enum MakeStage {
     /// The cameras of the photographs.
     Cameras,
     /// Diagnosis, training and scores.
@@ -31,7 +31,7 @@ pub enum Stage {
     Page,
 }
 
-impl Stage {
+impl MakeStage {
     /// Its name.
     pub fn name(self) -> &'static str {
         match self {
@@ -54,7 +54,7 @@ pub struct MadePaths {
     /// The page.
     pub page: PathBuf,
     /// In order; of two, the photographs have cameras.
-    pub stages: Vec<Stage>,
+    pub stages: Vec<MakeStage>,
 }
 
 impl MadePaths {
@@ -81,7 +81,7 @@ impl MadePaths {
             Dataset::listed(input, &LoadOptions::default())?;
         }
         check_apart(&out, input, false)?;
-        let stages = [Stage::Cameras, Stage::Training, Stage::Page];
+        let stages = [MakeStage::Cameras, MakeStage::Training, MakeStage::Page];
         Ok(Self {
             dataset: if is_dataset { input.to_owned() } else { out.join("dataset") },
             run: out.join("run"),
@@ -96,7 +96,7 @@ impl MadePaths {
     /// # Errors
     /// There are some of other photographs or options, which are not to be replaced.
     pub fn needs_cameras(&self, options: &PoseOptions) -> Result<bool> {
-        if !self.stages.contains(&Stage::Cameras) {
+        if !self.stages.contains(&MakeStage::Cameras) {
             return Ok(false);
         }
         if options.overwrite || !self.dataset.exists() {
@@ -117,16 +117,16 @@ impl MadePaths {
         options: &PoseOptions,
         config: &TrainConfig,
         is_cpu: bool,
-    ) -> Vec<(Stage, Option<f64>)> {
+    ) -> Vec<(MakeStage, Option<f64>)> {
         let left = self.stages.iter().filter(|stage| match stage {
-            Stage::Cameras => !pose::is_estimated(options),
-            Stage::Training => !run::is_finished(&self.run),
-            Stage::Page => true,
+            MakeStage::Cameras => !pose::is_estimated(options),
+            MakeStage::Training => !run::is_finished(&self.run),
+            MakeStage::Page => true,
         });
         let seconds = |stage| match stage {
-            Stage::Cameras => pose::expected(options),
-            Stage::Training => Some(training_seconds(&options.photos, config, is_cpu)),
-            Stage::Page => Some(10.0),
+            MakeStage::Cameras => pose::expected(options),
+            MakeStage::Training => Some(training_seconds(&options.photos, config, is_cpu)),
+            MakeStage::Page => Some(10.0),
         };
         left.map(|&stage| (stage, seconds(stage))).collect()
     }
@@ -174,7 +174,7 @@ mod tests {
         Image::filled(8, 8, [0.1; 3]).save_png8(photos.join("a.png")).unwrap();
         let made = MadePaths::new(&photos, None).unwrap();
         assert_eq!(made.page, folder.path().join("attic-splat/attic.html"));
-        assert_eq!(made.stages, [Stage::Cameras, Stage::Training, Stage::Page]);
+        assert_eq!(made.stages, [MakeStage::Cameras, MakeStage::Training, MakeStage::Page]);
         let made = MadePaths::new(&folder.path().join("walk.mp4"), None).unwrap();
         assert_eq!(made.dataset, folder.path().join("walk-splat/dataset"));
         for (input, out) in [("attic", "attic"), ("attic", "attic/splat"), ("attic", "")] {

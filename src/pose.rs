@@ -134,7 +134,7 @@ pub fn estimate(options: &PoseOptions, watch: &PoseWatch<'_>) -> Result<Posed> {
         return Err(Error::Usage(problem));
     }
     check_writable(&options.out)?;
-    let mut out = Unfinished::open(&options.out, options.overwrite, &origin::of(options))?;
+    let mut out = Unfinished::open(&options.out, options.overwrite, &origin::line(options))?;
     let posed = posed(options, &mut out, watch);
     if posed.as_ref().is_err_and(Error::is_stop) {
         out.keep();
@@ -144,7 +144,7 @@ pub fn estimate(options: &PoseOptions, watch: &PoseWatch<'_>) -> Result<Posed> {
 
 /// Whether there are cameras at `out`, as [`estimate`] finds them with these options.
 pub fn is_estimated(options: &PoseOptions) -> bool {
-    unfinished::origin_of(&options.out).is_some_and(|of| of == origin::of(options))
+    unfinished::origin_of(&options.out).is_some_and(|of| of == origin::line(options))
 }
 
 /// Seconds that it takes to find cameras with these options, within a factor of two or three; `None` of a clip, whose
@@ -154,7 +154,7 @@ pub fn expected(options: &PoseOptions) -> Option<f64> {
     let with = options.with.as_ref().and_then(|with| photographs_in(with).ok()).unwrap_or_default();
     let count = photographs.len() + with.len();
     let matcher = options.matcher.unwrap_or(Matcher::Exhaustive);
-    let seconds = expected::of(count, photographs.first().map(PathBuf::as_path), matcher);
+    let seconds = expected::seconds_of(count, photographs.first().map(PathBuf::as_path), matcher);
     Some(seconds.into_iter().sum())
 }
 

@@ -15,6 +15,7 @@
 //! - [`models`]: model files and run directories, read
 //! - [`finished_run`]: a finished run or a model file, opened for rendering
 //! - [`view_exposures`]: renders at the exposure of their targets
+//! - [`verdict`]: a sentence on a set of photographs, and on a trained model
 //! - [`video`]: frames as a video
 //! - [`export`]: a model in other formats
 //! - [`run_export`]: the export of a run
@@ -35,5 +36,6 @@ pub mod run;
 pub mod run_export;
 pub mod run_facts;
 pub mod sweep;
+pub mod verdict;
 pub mod video;
 pub mod view_exposures;

@@ -4,12 +4,14 @@
 //! training photographs -> measurements ┐
 //! settings of the curve ---------------┴-> SceneTone -> curve of each view, its inverse, the law of the scene
 //! photograph of a view, its curve -> pseudo-GT pass -> target
+//! pictures of another program --------------------> target
 //! ```
 
+pub mod external;
 pub mod pseudo_gt;
 pub mod structure;
 
-use nightsplat_core::Result;
+use nightsplat_core::{Error, Result};
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::scene_tone::SceneTone;
@@ -39,6 +41,16 @@ impl Targets {
         Ok(Self { pseudo_gt: PseudoGt::new(gpu, scene.settings())?, scene })
     }
 
+    /// The target of a view that another program made, of its photograph's size; `None` if a curve makes the targets.
+    pub(crate) fn external(&self, view: &View) -> Result<Option<Image>> {
+        match self.scene.settings().targets() {
+            None => Ok(None),
+            Some(folder) => view.external_target()?.map(Some).ok_or_else(|| {
+                Error::input(folder, format!("has no target for the photograph {}", view.name))
+            }),
+        }
+    }
+
     /// The target of a view, of its camera's size; `None` without a photograph.
     pub fn target(&self, view: &View) -> Result<Option<Image>> {
         let photograph = self.scene.source(view)?;
@@ -56,8 +68,13 @@ impl Targets {
 
     /// The target of a view with this photograph, of its camera's size.
     pub(crate) fn target_of(&self, view: &View, photograph: &Image) -> Result<Image> {
-        let tone_mapping = self.scene.tone_mapping_of(view, photograph)?;
-        let target = self.pseudo_gt.tone_mapped(photograph, &tone_mapping)?;
+        let target = match self.external(view)? {
+            Some(target) => target,
+            None => {
+                let tone_mapping = self.scene.tone_mapping_of(view, photograph)?;
+                self.pseudo_gt.tone_mapped(photograph, &tone_mapping)?
+            }
+        };
         Ok(target.resized(view.camera.width, view.camera.height))
     }
 }

@@ -2,6 +2,7 @@
 
 mod batching;
 mod cache;
+mod call;
 mod checkpoint;
 mod clock;
 mod config;
@@ -35,6 +36,7 @@ mod rendered;
 mod scoring;
 pub mod settings;
 mod start;
+mod stated;
 mod streams;
 mod submission;
 mod supervision;

@@ -6,14 +6,19 @@
 
 const uint CAMERA_PINHOLE = 0;
 const uint CAMERA_FISHEYE = 1;
+const uint CAMERA_ORTHOGRAPHIC = 2;
 
-#ifndef CAMERA_MODEL
+// Selected at run time are the cameras of training views, none of which is orthographic.
+#ifdef CAMERA_MODEL
+#define IS_ORTHOGRAPHIC false
+#else
 layout(constant_id = 7) const uint CAMERA_MODEL = 0;  // CAMERA_*
+#define IS_ORTHOGRAPHIC (CAMERA_MODEL == CAMERA_ORTHOGRAPHIC)
 #endif
 
 struct Camera {
     mat4x3 view_from_world;
-    vec2  focal;            // pixels
+    vec2  focal;            // pixels; orthographic: pixels per world unit
     vec2  principal_point;  // pixels
     uvec2 size;             // pixels
     vec2  min_slope;      // pinhole: the smallest x / z and y / z for the Jacobian
@@ -35,6 +40,7 @@ const float NEAREST = 1e-4;
 
 #include "camera_pinhole.glsl"
 #include "camera_fisheye.glsl"
+#include "camera_orthographic.glsl"
 
 // The depth of a point, for sorting and the near plane; not positive if the model does not see it.
 float camera_depth(vec3 point, Camera camera) {
@@ -45,12 +51,14 @@ float camera_depth(vec3 point, Camera camera) {
 // The pixel of a point of positive depth.
 vec2 camera_project(vec3 point, Camera camera) {
     if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_project(point, camera);
+    if (IS_ORTHOGRAPHIC) return orthographic_project(point, camera);
     return pinhole_project(point, camera);
 }
 
 // The derivative of the pixel with respect to the point.
 Jacobian camera_jacobian(vec3 point, Camera camera) {
     if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_jacobian(point, camera);
+    if (IS_ORTHOGRAPHIC) return orthographic_jacobian(camera);
     return pinhole_jacobian(point, camera);
 }
 

@@ -113,6 +113,10 @@ fn plan(args: &PlanArgs) -> Result<()> {
     let requested = args.options.requested(&args.dataset)?;
     let config = requested.settings(None)?.config()?;
     config.check()?;
+    if config.tone.targets().is_some() {
+        let problem = "blocks share a tone law, and targets of another program have none";
+        return Err(Error::Usage(problem.to_owned()).into());
+    }
     for (key, is_set) in [("init", config.init.is_some()), ("tone.law", config.tone.law.is_some())]
     {
         if is_set {

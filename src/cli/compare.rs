@@ -1,4 +1,4 @@
-//! `nightsplat compare`: runs on one dataset, side by side.
+//! `nightsplat compare`: runs on one dataset, and renders of other programs, side by side.
 
 use std::path::PathBuf;
 
@@ -10,19 +10,23 @@ use super::eval::LpipsRange;
 use super::{finish, opener, print, word};
 use crate::Error;
 use crate::gpu::DeviceChoice;
-use crate::results::comparison::{CompareOptions, RunComparison};
+use crate::results::comparison::{CompareOptions, NamedRenders, RunComparison};
 
 /// Compare runs or models on the test views of one dataset.
 ///
 /// Renders the test views of each and scores them against the same images: the references or, without any, the targets
-/// of the first run. Prints a row per run and, for every view, the PSNR of the first run and the gains of the others.
+/// of the first run; a model file states the tone curve and the size of its run. Prints a row per run and, for every view, the PSNR of the first run and the gains of the others.
 /// The page adds the settings that differ, and renders side by side, the most different views first.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct CompareArgs {
     /// Run directories, or models with --dataset; the first is the one that others are compared with
-    #[arg(required = true, num_args = 2..)]
+    #[arg(required = true)]
     pub runs: Vec<PathBuf>,
+    /// Renders of another program, scored as another row: a folder with a picture of every test view, of its size and
+    /// under its name; repeatable
+    #[arg(long, value_name = "NAME=DIR")]
+    pub renders: Vec<NamedRenders>,
     /// Write a page
     #[arg(long, value_name = "FILE.html")]
     pub report: Option<PathBuf>,
@@ -32,6 +36,9 @@ pub struct CompareArgs {
     /// Dataset, if it moved since training [default: the runs']
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
+    /// Score models that do not state their tone curve against the dark photographs, even if they are brighter
+    #[arg(long)]
+    pub photographs: bool,
     /// Add LPIPS, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)
     #[arg(long, value_name = "WEIGHTS")]
     pub lpips: Option<PathBuf>,
@@ -45,20 +52,23 @@ pub struct CompareArgs {
 
 const EXAMPLES: &str = "Examples:
   nightsplat compare run1 run2 --report compare.html
-  nightsplat compare run clean.ply --dataset photos       a run and its edited model";
+  nightsplat compare run clean.ply --dataset photos       a run and its edited model
+  nightsplat compare run --renders gsplat=other/renders   a run and the renders of another program";
 
 /// Compares the runs.
 pub fn run(args: &CompareArgs) -> Result<()> {
-    if args.runs.len() < 2 {
-        let problem = "compare takes two runs or more";
+    if args.runs.len() + args.renders.len() < 2 {
+        let problem = "compare takes two or more: <RUNS>..., or a run and --renders NAME=DIR";
         return Err(Error::Usage(problem.to_owned()).into());
     }
     args.report.iter().try_for_each(|path| check_writable(path))?;
     let options = CompareOptions {
+        renders: &args.renders,
         dataset: args.dataset.as_deref(),
         opener: opener(args.device.as_ref()),
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),
         with_pictures: args.report.is_some(),
+        photographs: args.photographs,
     };
     let comparison = RunComparison::new(&args.runs, &options)?;
     let mut wrote = String::new();

@@ -56,15 +56,17 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     let sweep: SweepArgs =
         parsed("demo", command("sweep", &paths, &[&SWEEP[..], &steps].concat()))?;
     let intro = format!(
-        "Trained on photographs that were exposed {} times too short, with shot and read noise, at 8 bits. Each \
-         tone curve maps the photographs to the targets of training. The reference images in normal light are used \
-         for the scores only.",
+        "Trained on photographs that are underexposed by a factor of {}, with shot and read noise, at 8 bits. Each tone \
+         curve maps the photographs to the targets of training. The reference images in normal light are used for the \
+         scores only.",
         nightsplat_synth::DARKENING
     );
-    let link =
-        [format!("{SHOWN}/model.html"), "Fly through the model of the curve auto".to_owned()];
+    let window = [
+        format!("{SHOWN}/model.html"),
+        "The model of the curve auto, in a window of its own".to_owned(),
+    ];
     let title = "3D Gaussian Splatting from dark photographs";
-    sweep::run_titled(&sweep, title, &[intro], &[link])?;
+    sweep::run_titled(&sweep, title, &[intro], Some(window))?;
     let shown = args.out.join(SHOWN);
     let export = command("export", &[&shown], &["--format", "html"]);
     export::write(&parsed::<ExportArgs>("demo", export)?)?;

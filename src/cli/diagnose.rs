@@ -10,6 +10,7 @@ use nightsplat_photographs::tree::check_writable;
 use serde::Serialize;
 
 use super::settings::{Selection, SettingOptions, push_dataset};
+use super::tell::wrapped;
 use super::{finish, opener, print, word, words};
 use crate::Error;
 use crate::driver;
@@ -17,6 +18,7 @@ use crate::gpu::DeviceChoice;
 use crate::results::diagnosis;
 use crate::results::eval::{ResidualTransmittance, hole_warning};
 use crate::results::finished_run::FinishedRun;
+use crate::results::verdict;
 use crate::train::diagnose::{Diagnosis, Plan};
 use crate::train::{Preset, RequestedSettings, diagnosed};
 
@@ -26,7 +28,9 @@ use crate::train::{Preset, RequestedSettings, diagnosed};
 /// parts of the model from that, each with its reason. `nightsplat train` does the same; this command shows why, and
 /// lets you edit the plan. Reference images are not used.
 ///
-/// Columns of the table: p10, p90, mean and cubic mean of the encoded luminance; r = p10 / p90; EV: stops above the
+/// Begins with a verdict and the photographs that need attention. -v adds all measurements and what is off.
+///
+/// Columns of the table of -v: p10, p90, mean and cubic mean of the encoded luminance; r = p10 / p90; EV: stops above the
 /// other views of the same points; white and black: values near white (0.94 and above) and zero values; codes: distinct
 /// values; luma and chroma noise: standard deviations in the target, after the tone curve, with JPEG and quantisation
 /// noise; blur: width of edges, pixels; points: visible points; overlap: share of the view that other views see.
@@ -85,8 +89,8 @@ const EXAMPLES: &str = "Examples:
   nightsplat diagnose photos --plan plan.toml           edit plan.toml, then
   nightsplat train photos --out run --plan plan.toml";
 
-/// Measures, plans and prints.
-pub fn run(args: &DiagnoseArgs) -> Result<()> {
+/// Measures, plans and prints; `everything`: with all measurements.
+pub fn run(args: &DiagnoseArgs, everything: bool) -> Result<()> {
     let mut requested = RequestedSettings { preset: args.preset, ..Default::default() };
     push_dataset(&mut requested.options, &args.dataset)?;
     args.settings.push(&mut requested.options)?;
@@ -114,7 +118,7 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
         let json = serde_json::to_string_pretty(&output);
         json.map_err(|error| Error::output("standard output", error.to_string()))? + "\n"
     } else {
-        text(device, &dataset, &diagnosis, &plan)
+        text(device, &dataset, &diagnosis, &plan, everything)
     };
     print(text)?;
     if args.json {
@@ -155,35 +159,57 @@ fn holes(
     Ok((remark, found))
 }
 
-fn text(device: &str, dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> String {
+/// The verdict, what needs attention, and what will be on; with `everything`, all measurements and what is off.
+fn text(
+    device: &str,
+    dataset: &Dataset,
+    diagnosis: &Diagnosis,
+    plan: &Plan,
+    everything: bool,
+) -> String {
     let Diagnosis { views, test_views, remarks, .. } = diagnosis;
-    let mut text = format!(
-        "{}\n{} photographs to train on ({}), {test_views} held out, {} points; on {device}\n\n",
-        one_line(&dataset.root.to_string_lossy()),
-        views.len(),
-        diagnosis::sizes(views),
-        dataset.points.len()
-    );
-    text += &diagnosis::table(diagnosis).text();
-    text.push('\n');
-    for [name, figures] in diagnosis::scene_facts(&diagnosis.scene) {
-        text += &format!("{name:<12}{figures}\n");
-    }
+    let mut text = wrapped(&verdict::of_set(diagnosis), 0);
     for remark in remarks {
-        text += &format!("note: {}\n", one_line(remark));
+        text += &wrapped(&format!("note: {}", one_line(remark)), 6);
     }
     text.push('\n');
-    text + &decisions(plan)
+    if everything {
+        text += &wrapped(
+            &format!(
+                "{}: {} photographs to train on ({}), {test_views} held out, {} points; on {device}",
+                one_line(&dataset.root.to_string_lossy()),
+                views.len(),
+                diagnosis::sizes(views),
+                dataset.points.len()
+            ),
+            0,
+        );
+        text.push('\n');
+        text += &diagnosis::table(diagnosis).text();
+        text.push('\n');
+        for [name, figures] in diagnosis::scene_facts(&diagnosis.scene) {
+            text += &wrapped(&format!("{name:<12}{figures}"), 12);
+        }
+        text.push('\n');
+    }
+    text += &decisions(plan, everything);
+    if !everything {
+        text += "-v shows all measurements, and what is off\n";
+    }
+    text
 }
 
-/// The plan, one decision per line.
-pub(super) fn decisions(plan: &Plan) -> String {
+/// The plan, one decision per paragraph; without `everything`, what is on.
+pub(super) fn decisions(plan: &Plan, everything: bool) -> String {
     let decisions = plan.decisions();
+    let shown: Vec<&(&str, String, &str)> =
+        decisions.iter().filter(|(_, decided, _)| everything || decided != "off").collect();
     let width =
         |of: fn(&(&str, String, &str)) -> usize| decisions.iter().map(of).max().unwrap_or(0);
     let (name, value) = (width(|one| one.0.len()), width(|one| one.1.len()));
-    let line = |(part, decided, why): &(&str, String, &str)| {
-        format!("{part:name$}  {decided:value$}  {}\n", one_line(why))
+    let paragraph = |(part, decided, why): &&(&str, String, &str)| {
+        let text = format!("{part:name$}  {decided:value$}  {}", one_line(why));
+        wrapped(&text, name + value + 4)
     };
-    decisions.iter().map(line).collect()
+    shown.iter().map(paragraph).collect()
 }

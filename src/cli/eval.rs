@@ -8,7 +8,7 @@ use nightsplat_core::output::{one_line, write_whole};
 use nightsplat_photographs::dataset::DOWNSCALE;
 use nightsplat_photographs::tree::check_writable;
 
-use super::{finish, opener, print, progress_bar, word};
+use super::{finish, opener, print, progress_bar, with_dataset};
 use crate::Error;
 use crate::gpu::DeviceChoice;
 use crate::networks::lpips::Range;
@@ -40,11 +40,16 @@ pub struct EvalArgs {
     /// Score at 1/F of the size of the photographs, for a model that was trained at another [default: the run's]
     #[arg(long, value_name = "F")]
     pub downscale: Option<f64>,
+    /// Score the renders of another program in place of the run's: a folder with a picture of every test view, of its
+    /// size and under its name
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["photographs", "save_images"])]
+    pub renders: Option<PathBuf>,
     /// Add the scores after the least-squares gain and bias of each channel of each view, which use the reference
     #[arg(long)]
     pub align: bool,
     /// Add the scores of the renders as dark photographs, against the photographs of the test views: PSNR, by how many
-    /// stops the render is brighter, and by how much the tone curve, which multiplies differences, raises that PSNR
+    /// stops the render is brighter, and by how much the tone curve, which multiplies differences, raises that PSNR. A
+    /// model that does not state its tone curve is scored against them alone
     #[arg(long)]
     pub photographs: bool,
     /// Add LPIPS, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)
@@ -53,6 +58,9 @@ pub struct EvalArgs {
     /// Input range of the LPIPS network; scores of different ranges or networks do not compare
     #[arg(long, value_name = "RANGE", value_enum, default_value_t, requires = "lpips")]
     pub lpips_range: LpipsRange,
+    /// Add SSIM with a uniform window of 7x7 and sample covariances, as scikit-image's default and RealX3D's tables
+    #[arg(long)]
+    pub uniform_ssim: bool,
     /// Write renders and references (or targets) to RUN/eval; of MODEL.ply, to MODEL.eval
     #[arg(long)]
     pub save_images: bool,
@@ -99,8 +107,10 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         dataset: args.dataset.as_deref(),
         reference: args.reference.as_deref(),
         downscale: args.downscale,
+        renders: args.renders.as_deref(),
         opener: opener(args.device.as_ref()),
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),
+        uniform_ssim: args.uniform_ssim,
         align: args.align,
         photographs: args.photographs,
         images: images.as_deref(),
@@ -123,7 +133,8 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     print(scored.evaluation.table().text())?;
     scored.notes().iter().try_for_each(|note| print(one_line(note)))?;
     let wrote = args.report.iter().chain(&images).map(|path| path.display().to_string());
-    let next = format!("nightsplat render {} --split all --out pictures", word(&args.run));
+    let run = with_dataset(&args.run, args.dataset.as_deref());
+    let next = format!("nightsplat render {run} --split all --out pictures");
     finish(&wrote.collect::<Vec<_>>().join(", "), &next);
     Ok(())
 }

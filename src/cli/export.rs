@@ -28,12 +28,12 @@ pub struct ExportArgs {
     /// File to write or replace [default: model.FORMAT in the run]
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
-    /// The dataset's up direction: x, y, z, -x, -y, -z or X,Y,Z. It becomes +Y in GLB and SPZ, -Y in PLY and SOG;
-    /// none keeps the dataset's axes [default: the run's for GLB, SPZ and html; none for PLY and SOG]
+    /// The dataset's up direction: x, y, z, -x, -y, -z or X,Y,Z. It becomes +Y in GLB, USD and SPZ, -Y in PLY and
+    /// SOG; none keeps the dataset's axes [default: the run's for GLB, USD, SPZ and html; none for PLY and SOG]
     #[arg(long, value_name = "DIRECTION", allow_hyphen_values = true)]
     pub up: Option<Up>,
     /// Colours in linear light, for engines: that of the photographs, raised to the brightness of the target by the
-    /// stops that the file states. For ply and glb, whose numbers are floats
+    /// stops that the file states. For ply, glb, usda and usdz, whose numbers are floats
     #[arg(long)]
     pub linear: bool,
     /// Version of SPZ; more programs read 3
@@ -49,7 +49,7 @@ pub struct ExportArgs {
     #[arg(long, value_name = "N", default_value_t = Division::default().chunk)]
     pub chunk: usize,
     /// The largest file, such as 8M: coefficients of colours are left out, then levels of detail, until it fits; in
-    /// html, photographs shrink. For html, spz, glb and sog
+    /// html, photographs shrink. Not for ply and streamed-sog
     #[arg(long, value_name = "SIZE")]
     pub max_size: Option<CacheSize>,
     /// For html: number of views to start from, with photographs
@@ -81,6 +81,7 @@ const EXAMPLES: &str = "Examples:
   nightsplat export run --format html --max-size 8M --title 'Our attic'
   nightsplat export run --format spz --out a.spz  a tenth of the size, eight bits per number
   nightsplat export run --format glb              glTF with KHR_gaussian_splatting, at full precision
+  nightsplat export run --format usda             OpenUSD 26.03, at full precision, as text; usdz is its package
   nightsplat export run --format streamed-sog     run/model.streamed-sog: levels of detail, for large scenes";
 
 /// Writes the file.
@@ -89,6 +90,9 @@ pub fn run(args: &ExportArgs) -> Result<()> {
     let out = word(&written.path);
     let next = match args.format {
         Format::Html => format!("open {out} in a browser"),
+        Format::Usda | Format::Usdz => {
+            format!("open {out} in usdview or an engine with OpenUSD 26.03")
+        }
         Format::Spz(_) | Format::Sog | Format::Glb => {
             format!("open {out} in a viewer of Gaussian splats")
         }
@@ -204,7 +208,7 @@ fn check_page(args: &ExportArgs) -> crate::Result<()> {
     let is_sized = !matches!(args.format, Format::Ply | Format::StreamedSog);
     let has_page_options = args.title.is_some() || args.text.is_some() || args.url.is_some();
     let problem = if args.max_size.is_some() && !is_sized {
-        "--max-size is of --format html, spz, glb and sog; pass --level for another"
+        "--max-size is not of --format ply and streamed-sog; pass --level"
     } else if has_page_options && args.format != Format::Html {
         "--title, --text and --url are of --format html"
     } else if args.url.as_ref().is_some_and(|url| !url.starts_with("http")) {
@@ -221,7 +225,7 @@ fn check_linear(args: &ExportArgs) -> crate::Result<()> {
     let problem = match args.format {
         _ if !args.linear => return Ok(()),
         Format::Spz(_) | Format::Sog | Format::StreamedSog | Format::Html => {
-            "--linear needs floats; export to ply or glb".to_owned()
+            "--linear needs floats; export to ply, glb or usda".to_owned()
         }
         _ if is_model(&args.run) => {
             let run = args.run.display();
@@ -229,7 +233,7 @@ fn check_linear(args: &ExportArgs) -> crate::Result<()> {
                 "--linear inverts the tone curve of a run, and {run} is a model file; pass the run directory"
             )
         }
-        Format::Ply | Format::Glb => return Ok(()),
+        Format::Ply | Format::Glb | Format::Usda | Format::Usdz => return Ok(()),
     };
     Err(Error::Usage(problem))
 }

@@ -37,7 +37,7 @@ const GROUPS: [(&str, &str); 6] = [
     ),
     (
         "Tone curve",
-        "curve profile gain brightness colour theta scene-statistics law exposure exposures",
+        "curve profile targets gain brightness colour theta scene-statistics law exposure exposures",
     ),
     (
         "Model",

@@ -15,7 +15,7 @@ use super::{one_line, signals, tell, tell_on_stderr, word};
 use crate::driver;
 use crate::gpu::DeviceChoice;
 use crate::live;
-use crate::make::{MadePaths, Stage};
+use crate::make::{MadePaths, MakeStage};
 use crate::pose::PoseOptions;
 use crate::results::run::{Requests, has_checkpoint};
 use crate::{Error, Stop};
@@ -67,8 +67,8 @@ const EXAMPLES: &str = "Examples:
   nightsplat photos --downscale 2 --preset draft        a first look, sooner
   nightsplat photos --finish                            enough: end the stopped training, write the page";
 
-/// Runs the stages that are left.
-pub fn run(args: &MakeArgs) -> Result<()> {
+/// Runs the stages that are left; `everything`: prints also what the plan leaves off.
+pub fn run(args: &MakeArgs, everything: bool) -> Result<()> {
     let made = MadePaths::new(&args.photos, args.out.as_deref())?;
     if args.finish && !has_checkpoint(&made.run) {
         let problem = "has no checkpoint to finish from; without --finish, the training goes on";
@@ -91,15 +91,16 @@ pub fn run(args: &MakeArgs) -> Result<()> {
     display.tell_times();
     let requests = signals::requests()?;
     if needs_cameras {
-        display.begin(Stage::Cameras);
-        let wrote = pose::posed(&cameras, &display.prefix(Stage::Cameras), &requests)?;
+        display.begin(MakeStage::Cameras);
+        let wrote = pose::posed(&cameras, &display.prefix(MakeStage::Cameras), &requests)?;
         if form != ProgressForm::Json {
             tell(one_line(&wrote));
         }
         stop_between(&made, &requests)?;
     }
-    display.begin(Stage::Training);
-    train::train(&training(args, &made, display.prefix(Stage::Training)), Some(&requests))?;
+    display.begin(MakeStage::Training);
+    let training = training(args, &made, display.prefix(MakeStage::Training));
+    train::train(&training, everything, Some(&requests))?;
     let page = page(args, &made)?;
     display.end(&page, open_page(&page, args.no_open));
     Ok(())
@@ -109,7 +110,7 @@ pub fn run(args: &MakeArgs) -> Result<()> {
 struct Display<'a> {
     made: &'a MadePaths,
     /// Estimates of the stages that are left, in seconds.
-    times: Vec<(Stage, Option<f64>)>,
+    times: Vec<(MakeStage, Option<f64>)>,
     form: ProgressForm,
 }
 
@@ -121,13 +122,13 @@ impl Display<'_> {
     }
 
     /// Begins every line of a stage: "2 of 3 training: ".
-    fn prefix(&self, stage: Stage) -> String {
+    fn prefix(&self, stage: MakeStage) -> String {
         let stages = &self.made.stages;
         let before = stages.iter().take_while(|&&one| one != stage).count();
         format!("{} of {} {}: ", before + 1, stages.len(), stage.name())
     }
 
-    fn begin(&self, stage: Stage) {
+    fn begin(&self, stage: MakeStage) {
         let time = self.times.iter().find_map(|(of, time)| time.filter(|_| *of == stage));
         if self.form != ProgressForm::None {
             let time = time.map_or_else(|| "begins".to_owned(), about);
@@ -139,7 +140,7 @@ impl Display<'_> {
         if self.form == ProgressForm::Json {
             return tell(serde_json::json!({ "event": "page", "path": page, "opens": opens }));
         }
-        let wrote = format!("{}wrote {}", self.prefix(Stage::Page), page.display());
+        let wrote = format!("{}wrote {}", self.prefix(MakeStage::Page), page.display());
         let next = match opens {
             true => "it opens in your browser".to_owned(),
             false => format!("open {} in a browser", word(page)),
@@ -149,9 +150,9 @@ impl Display<'_> {
 }
 
 /// The estimates in a line, as coarse as they are.
-fn expected(times: &[(Stage, Option<f64>)]) -> String {
+fn expected(times: &[(MakeStage, Option<f64>)]) -> String {
     let known: f64 = times.iter().filter_map(|(_, seconds)| *seconds).sum();
-    let part = |(stage, seconds): &(Stage, Option<f64>)| match seconds {
+    let part = |(stage, seconds): &(MakeStage, Option<f64>)| match seconds {
         Some(seconds) => format!("{} {}", stage.name(), about(*seconds)),
         None => format!("{} as its frames need", stage.name()),
     };
@@ -164,7 +165,7 @@ fn expected(times: &[(Stage, Option<f64>)]) -> String {
 fn stop_between(made: &MadePaths, requests: &Requests) -> Result<()> {
     let stopped = |cause: Stop| Error::StageStopped {
         folder: made.out.clone(),
-        stage: Stage::Training.name().to_owned(),
+        stage: MakeStage::Training.name().to_owned(),
         cause,
     };
     requests.stops().map_or(Ok(()), |cause| Err(stopped(cause).into()))
@@ -233,27 +234,27 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let photos = folder.path().to_str().unwrap();
         let command = crate::cli::help::command(false);
-        let place = |line: &[&str]| {
+        let found = |line: &[&str]| {
             let words: Vec<OsString> = line.iter().map(OsString::from).collect();
             place_of_photographs(&command, &words)
         };
-        assert_eq!(place(&["nightsplat", photos, "--no-open"]), Some(1));
-        assert_eq!(place(&["nightsplat", "-v", photos]), Some(2));
+        assert_eq!(found(&["nightsplat", photos, "--no-open"]), Some(1));
+        assert_eq!(found(&["nightsplat", "-v", photos]), Some(2));
         for line in
             [&["nightsplat"][..], &["nightsplat", "train", photos], &["nightsplat", "--help"]]
         {
-            assert_eq!(place(line), None);
+            assert_eq!(found(line), None);
         }
-        assert_eq!(place(&["nightsplat", &format!("{photos}/absent")]), None);
+        assert_eq!(found(&["nightsplat", &format!("{photos}/absent")]), None);
     }
 
     #[test]
     fn the_time_is_told_as_coarsely_as_it_is_known() {
-        let stages = [(Stage::Cameras, Some(340.0)), (Stage::Training, Some(200.0))];
+        let stages = [(MakeStage::Cameras, Some(340.0)), (MakeStage::Training, Some(200.0))];
         let line =
             "about 9 min in all, a coarse estimate: cameras about 6 min, training about 3 min";
         assert_eq!(expected(&stages), line);
-        let line = expected(&[(Stage::Cameras, None), (Stage::Page, Some(10.0))]);
+        let line = expected(&[(MakeStage::Cameras, None), (MakeStage::Page, Some(10.0))]);
         assert!(line.starts_with("about 10 s and more in all"), "{line}");
     }
 }

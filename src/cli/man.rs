@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 use clap::Command;
 use clap_mangen::Man;
-use nightsplat_core::output::write_whole;
+use nightsplat_core::output::{create_folder, write_whole};
 
 use super::{finish, help};
 use crate::Error;
@@ -21,7 +21,7 @@ pub struct ManArgs {
 /// Writes the pages.
 pub fn run(args: &ManArgs) -> anyhow::Result<()> {
     let problem = |error: std::io::Error| Error::output(&args.dir, error.to_string());
-    std::fs::create_dir_all(&args.dir).map_err(problem)?;
+    create_folder(&args.dir)?;
     let mut command = help::command(true).disable_help_subcommand(true);
     command.build();
     let nested = command.get_subcommands().flat_map(Command::get_subcommands);

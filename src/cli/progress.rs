@@ -251,7 +251,7 @@ impl Reporter {
 }
 
 /// The mean scores in a line; `None` if nothing was scored.
-pub(crate) fn summary(evaluation: &Evaluation) -> Option<String> {
+fn summary(evaluation: &Evaluation) -> Option<String> {
     let mean = |metric, after| evaluation.mean(metric, after);
     let psnr = mean(Metric::Psnr, After::Model)?;
     let channel_mean = mean(Metric::PsnrChannelMean, After::Model)?;

@@ -10,7 +10,7 @@ mod shots;
 
 use self::shots::{Shot, shots};
 use super::words::NamedValues;
-use super::{OutputFormat, finish, opener, progress_bar, word};
+use super::{OutputFormat, finish, opener, progress_bar, with_dataset};
 use crate::Error;
 use crate::gpu::DeviceChoice;
 use crate::results::colour_map;
@@ -70,9 +70,9 @@ pub struct RenderArgs {
     /// Also write a video, with ffmpeg, or an animated PNG for FILE.png
     #[arg(long, value_name = "FILE")]
     pub video: Option<PathBuf>,
-    /// Folder for the images, one per view; images of the same names are replaced
-    #[arg(long, value_name = "DIR")]
-    pub out: PathBuf,
+    /// Folder for the images, one per view; images of the same names are replaced [default with --video: none]
+    #[arg(long, value_name = "DIR", required_unless_present = "video")]
+    pub out: Option<PathBuf>,
     /// Dataset, if it moved since training [default: the run's]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
@@ -105,9 +105,9 @@ pub struct RenderArgs {
 
 const EXAMPLES: &str = "Examples:
   nightsplat render run --split test --out pictures
-  nightsplat render run --path auto --frames 180 --out frames --video flight.mp4
+  nightsplat render run --path auto --frames 180 --video flight.mp4
   nightsplat render run --path interpolate --out frames --video moving.png
-  nightsplat render run --path keyframes.json --size 1280x720 --out frames --video film.mp4
+  nightsplat render run --path keyframes.json --size 1280x720 --video film.mp4
   nightsplat render run --split test --layer depth --out depths
   nightsplat render run --split test --as linear --format exr --out light";
 
@@ -258,7 +258,7 @@ impl SplitChoice {
 
 /// Renders the views or the path.
 pub fn run(args: &RenderArgs) -> Result<()> {
-    let RenderArgs { run, out, layer, view_exposure, format, device, .. } = args;
+    let RenderArgs { run, layer, view_exposure, format, device, .. } = args;
     if let Some(video) = args.video.as_ref().filter(|_| *format == OutputFormat::Exr) {
         let problem =
             format!("--video {} requires PNG frames; leave out --format exr", video.display());
@@ -277,7 +277,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
             format!("--fov {fov} is no field of view; it is above 0 and below 180 degrees");
         return Err(Error::Usage(problem).into());
     }
-    args.video.iter().chain([out]).try_for_each(|path| check_writable(path))?;
+    args.video.iter().chain(&args.out).try_for_each(|path| check_writable(path))?;
     let FinishedRun { config, dataset, mut model_renderer, lamp, .. } =
         FinishedRun::open(run, args.dataset.as_deref(), &opener(device.as_ref()))?;
     if args.lamp {
@@ -296,7 +296,15 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     };
     let mut clipped = Clipped::default();
     model_renderer.set_background(args.background.0);
-    make_folder(out, &dataset, run)?;
+    // The frames of a video alone.
+    let mut frames = None;
+    let out = match &args.out {
+        Some(out) => {
+            make_folder(out, &dataset, run)?;
+            out.as_path()
+        }
+        None => frames.insert(tempfile::tempdir()?).path(),
+    };
     let bar = progress_bar(shots.len());
     for Shot { name, camera, orientation } in &shots {
         bar.set_message(one_line(name).into_owned());
@@ -336,13 +344,24 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     }
     bar.finish_and_clear();
     clipped.warn();
-    let mut wrote = format!("{} images to {}", shots.len(), out.display());
+    let mut wrote = vec![];
+    wrote.extend(
+        args.out.as_ref().map(|out| format!("{} images to {}", shots.len(), out.display())),
+    );
     if let Some(video) = &args.video {
         let files: Vec<PathBuf> = shots.iter().map(|shot| file(out, &shot.name, *format)).collect();
-        video::make(video, out, &files, fps)?;
-        wrote += &format!(", {}", video.display());
+        let made = video::make(video, out, &files, fps);
+        if let (Err(_), Some(frames)) = (&made, &mut frames) {
+            // The message says how to make a video of them.
+            frames.disable_cleanup(true);
+        }
+        made?;
+        wrote.push(video.display().to_string());
     }
-    finish(&wrote, &format!("nightsplat export {} --format html", word(run)));
+    finish(
+        &wrote.join(", "),
+        &format!("nightsplat export {} --format html", with_dataset(run, args.dataset.as_deref())),
+    );
     Ok(())
 }
 

@@ -137,8 +137,9 @@ fn help(row: &Setting) -> String {
 #[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, Default, Args)]
 pub(super) struct CurveOptions {
-    /// Tone curve: a name from `nightsplat tone list`, or a .toml, .csv or .cube file [default: {tone.curve}]
-    #[arg(long, value_name = "NAME|FILE", value_parser = words::curves::<CurveChoice>())]
+    /// Tone curve: a name from `nightsplat tone list`, a formula of t = x / p90 or of x with constants, such as
+    /// 'a*t/(t+b); a = 1.2; b = 0.3', or a .toml, .csv or .cube file [default: {tone.curve}]
+    #[arg(long, value_name = "NAME|FORMULA|FILE", value_parser = words::curves::<CurveChoice>())]
     pub(super) curve: Option<CurveChoice>,
     /// Camera profile from `nightsplat tone fit --profile`, in place of a curve; scores are marked, as they depend on
     /// its references
@@ -167,7 +168,7 @@ impl CurveOptions {
                 Some((ToneSettings::new(Tone::Profile(Profile::load(file)?)), "--profile"))
             }
             (Some(CurveChoice::Named(curve)), _) => {
-                layer.push("tone.curve", curve.name().into(), Origin::Option("--curve"))?;
+                layer.push("tone.curve", curve.to_string().into(), Origin::Option("--curve"))?;
                 None
             }
             (Some(file), _) => {
@@ -202,6 +203,15 @@ pub(super) fn push_curve(
     table.into_iter().try_for_each(|(name, value)| {
         layer.push(&format!("tone.{name}"), value, Origin::Option(option))
     })
+}
+
+/// Adds the targets that another program made, which no curve makes.
+pub(super) fn push_targets(layer: &mut SettingsLayer, folder: &Path) -> Result<()> {
+    let text = folder
+        .to_str()
+        .ok_or_else(|| Error::input(folder, "is not Unicode; move it to a path that is"))?;
+    layer.push("tone.curve", "targets".into(), Origin::Option("--targets"))?;
+    layer.push("tone.targets", text.into(), Origin::Option("--targets"))
 }
 
 /// Adds the dataset that the command line names.

@@ -15,6 +15,14 @@ use crate::{Error, Result, Stop};
 /// this time of the first is no second one.
 const SAME_WITHIN: Duration = Duration::from_secs(1);
 
+/// Has a file beyond the limit of its size (`ulimit -f`) be an error of writing, with its path, instead of the end of the
+/// process.
+pub fn report_long_files() {
+    // Without a handler it is as it was.
+    #[cfg(unix)]
+    let _ = flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
+}
+
 /// Installs the handlers and returns the requests that they set.
 pub(super) fn requests() -> Result<Requests> {
     let refused =

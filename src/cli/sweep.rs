@@ -25,7 +25,7 @@ use anyhow::Result;
 use clap::Args;
 use nightsplat_core::input;
 use nightsplat_core::output::{create_folder, write_whole};
-use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::dataset::{Dataset, View, ViewPictures};
 use nightsplat_photographs::tone::Statistics;
 use nightsplat_photographs::tree::check_writable;
 use serde::Serialize;
@@ -39,6 +39,7 @@ use super::{finish, print, progress_bar, tell};
 use crate::Error;
 use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
+use crate::results::comparison::NamedRenders;
 use crate::results::sweep::{
     ADAPTIVE, COST_FILES, FailedPoint, LEADERBOARD_FILES, Leaderboard, OFFSET, PARTS, SweepAxis,
     SweepResults, SweepRun,
@@ -57,7 +58,8 @@ use crate::train::{Part, TrainConfig, diagnosed};
 pub struct SweepArgs {
     /// Dataset, as for `train`
     pub dataset: PathBuf,
-    /// More datasets: each is swept in its own folder of OUT, and OUT/scenes.md has a column for each and their mean
+    /// More datasets: each is swept in its own folder of OUT, and OUT/index.html and OUT/scenes.md have a column for
+    /// each and their mean
     #[arg(value_name = "DATASET")]
     pub more: Vec<PathBuf>,
     /// Folder for the run directories, index.html, costs.html and tables as CSV
@@ -93,6 +95,10 @@ pub struct SweepArgs {
     /// Values of any key of config.toml, such as `density.min_opacity=0.005,0.01`; repeatable
     #[arg(long, value_name = "KEY=LIST", help_heading = GRID)]
     grid: Vec<String>,
+    /// Renders of another program as another row: a folder with a picture of every test view, of its size and under its
+    /// name; with several datasets, a folder of each in it; repeatable
+    #[arg(long, value_name = "NAME=DIR", help_heading = GRID)]
+    renders: Vec<NamedRenders>,
     #[command(flatten)]
     options: Options,
 }
@@ -104,6 +110,7 @@ const EXAMPLES: &str = "A LIST is comma-separated. Examples:
   nightsplat sweep photos --out parts --table parts --seeds 1,2,3
   nightsplat sweep photos --out presets --table presets --eval-every 50
   nightsplat sweep lom/buu lom/chair --out lom --curves ap3,ase --lpips lpips-alex.safetensors
+  nightsplat sweep photos --out mine --curves 'ap3,a*t/(t+b); a = 1.1; b = 0.3' --renders other=pictures
   nightsplat sweep photos --out density --grid density.gradient_threshold=1e-4,2e-4 --jobs 2";
 
 /// Trains the unfinished points and writes the results.
@@ -111,18 +118,19 @@ pub fn run(args: &SweepArgs) -> Result<()> {
     if !args.more.is_empty() {
         return scenes::run(args);
     }
-    let dataset = args.dataset.display();
-    run_titled(args, &format!("Sweep of {dataset}"), &[], &[])
+    let dataset = std::path::absolute(&args.dataset)?;
+    let name = dataset.file_name().unwrap_or_default().to_string_lossy();
+    run_titled(args, &format!("Sweep of {name}"), &[], None)
 }
 
-/// As [`run`], with a title, an introduction and links for the page.
+/// As [`run`], with a title, an introduction and the page of a model for the page.
 pub(super) fn run_titled(
     args: &SweepArgs,
     title: &str,
     intro: &[String],
-    links: &[[String; 2]],
+    window: Option<[String; 2]>,
 ) -> Result<()> {
-    let Some((rows, failures)) = swept(args, title, intro, links)? else { return Ok(()) };
+    let Some((rows, failures)) = swept(args, title, intro, window)? else { return Ok(()) };
     if let Some(failure) = failures.first() {
         let (failed, all) = (failures.len(), rows.runs);
         anyhow::bail!("{failed} of {all} points failed; the first: {}", failure.reason);
@@ -135,7 +143,7 @@ fn swept(
     args: &SweepArgs,
     title: &str,
     intro: &[String],
-    links: &[[String; 2]],
+    window: Option<[String; 2]>,
 ) -> Result<Option<(SweepResults, Vec<FailedPoint>)>> {
     check_writable(&args.out)?;
     let (trainings, dataset) = plan(args)?;
@@ -158,12 +166,15 @@ fn swept(
     }
     let bar = progress_bar(left.len());
     let failures = runner::train(&left, args.jobs.into(), &bar, &args.out, trainings.len())?;
-    let runs: Vec<SweepRun> = trainings.iter().map(|training| training.run.clone()).collect();
+    let mut runs: Vec<SweepRun> = trainings.iter().map(|training| training.run.clone()).collect();
 
     if let Some(weights) = &args.lpips {
         let finished = runs.iter().filter(|run| run.metrics().is_some());
         let folders: Vec<&Path> = finished.map(|run| run.folder.as_path()).collect();
         scores::add_lpips(&folders, &open(first)?, weights, args.lpips_range.into())?;
+    }
+    for renders in &args.renders {
+        runs.push(scores::of_renders(renders, args, &dataset, first)?);
     }
     let rows = SweepResults::new(&runs, args.table.and_then(Grid::baseline));
     let settings = settings(&trainings, &rows.seeds, &args.options.shared);
@@ -171,7 +182,7 @@ fn swept(
         rows: &rows,
         title: title.to_owned(),
         intro: intro.iter().cloned().chain([settings]).collect(),
-        links: links.to_vec(),
+        window,
         adaptive_offset: adaptive_offset(&trainings, &dataset),
         failures: &failures,
     };
@@ -244,6 +255,14 @@ fn plan(args: &SweepArgs) -> crate::Result<(Vec<SweepTraining>, Dataset)> {
         let problem = "has no held-out view to score; pass --test-every N, or list one in transforms_test.json or \
          test.txt: of eight photographs or more every eighth is held out";
         return Err(Error::input(&dataset.root, problem));
+    }
+    for NamedRenders { folder, .. } in &args.renders {
+        if !dataset.test_views().any(View::has_reference) {
+            let problem = "has no reference images: each run is scored against its own targets, with which --renders \
+                           do not compare; `nightsplat compare` scores all against those of one run";
+            return Err(Error::input(&dataset.root, problem));
+        }
+        ViewPictures::of_tests(folder, &dataset)?;
     }
     if !dataset.train_views().any(|view| view.depth.is_some()) {
         trainings.retain(|it| it.run.point.value(PARTS) != Some(Part::Depth.name()));

@@ -12,7 +12,8 @@ use nightsplat_photographs::tree::check_writable;
 
 pub(crate) use self::options::TrainOptions;
 use super::diagnose;
-use super::progress::{ProgressForm, Reporter, summary};
+use super::progress::{ProgressForm, Reporter};
+use super::tell::wrapped;
 use super::{finish, phases, print, signals, stopped, tell, view, word};
 use crate::Error;
 use crate::driver;
@@ -21,6 +22,7 @@ use crate::live;
 use crate::results::eval;
 use crate::results::run::{self, Event, IfExists, Requests, RunDirectory, RunSummary, Session};
 use crate::results::run_facts::RunFacts;
+use crate::results::verdict;
 use crate::train::diagnose::Plan;
 use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 
@@ -82,9 +84,9 @@ pub struct TrainArgs {
 const EXAMPLE: &str = "Example:
   nightsplat train photos --out run --preset fast --max-vram 4G";
 
-/// Trains, scores and writes the run directory.
-pub fn run(args: &TrainArgs) -> Result<()> {
-    if let Some(wrote) = train(args, None)? {
+/// Trains, scores and writes the run directory; `everything`: prints also what the plan leaves off.
+pub fn run(args: &TrainArgs, everything: bool) -> Result<()> {
+    if let Some(wrote) = train(args, everything, None)? {
         finish(&wrote, &next(args));
     }
     Ok(())
@@ -92,7 +94,11 @@ pub fn run(args: &TrainArgs) -> Result<()> {
 
 /// Trains, scores and writes the run directory; the requests are by default those of signals. Returns what was written,
 /// unless only JSON or an explanation is wanted.
-pub(super) fn train(args: &TrainArgs, requests: Option<&Requests>) -> Result<Option<String>> {
+pub(super) fn train(
+    args: &TrainArgs,
+    everything: bool,
+    requests: Option<&Requests>,
+) -> Result<Option<String>> {
     let mut requested = args.options.requested(&args.dataset)?;
     requested.settings(None)?.config()?.check()?;
     check_writable(&args.out)?;
@@ -141,8 +147,10 @@ pub(super) fn train(args: &TrainArgs, requests: Option<&Requests>) -> Result<Opt
     let (is_text, is_quiet) = (form != ProgressForm::Json, form == ProgressForm::None);
     let facts = RunFacts::new(&gpu, &config, plan.as_ref(), &dataset);
     if is_text && !is_quiet {
-        let plan = plan.as_ref().map(diagnose::decisions).unwrap_or_default();
-        tell(facts.text() + &plan);
+        let plan = plan.as_ref().map(|plan| diagnose::decisions(plan, everything));
+        let lines = facts.text();
+        let facts: String = lines.lines().map(|line| wrapped(line, 0)).collect();
+        tell(facts + &plan.unwrap_or_default());
     }
     let if_exists =
         if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
@@ -180,14 +188,11 @@ pub(super) fn train(args: &TrainArgs, requests: Option<&Requests>) -> Result<Opt
     }
     let gaussians = trainer.gaussian_count();
     tell(ended);
-    if let Some(line) = summary(&evaluation) {
-        tell(line);
+    if let Some(sentence) = verdict::of_model(&evaluation) {
+        tell(wrapped(&sentence, 0));
     }
     if let Some(reference_settings) = config.tone.knows_references() {
         tell(eval::with_reference(&reference_settings));
-    }
-    if let Some(label) = evaluation.label() {
-        tell(format_args!("the scores are {label}"));
     }
     let (steps, seconds) = (trainer.steps_done(), spent.seconds);
     tell(format_args!("{steps} steps, {gaussians} Gaussians, {seconds:.0} s"));

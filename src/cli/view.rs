@@ -88,7 +88,7 @@ fn opened(args: &ViewArgs) -> Result<Arc<Site>> {
         if args.dataset.is_none() {
             return of_model(path, feed, &gaussians, &facts);
         }
-        let config = config_of_file(&gaussians, &facts, args.dataset.as_deref());
+        let config = config_of_file(path, &gaussians, &facts, args.dataset.as_deref())?;
         return of_dataset(path, feed, Pictures::load(config, gpu)?, &facts);
     }
     if path.join("config.toml").is_file() {
@@ -122,7 +122,7 @@ fn of_dataset(
     let dataset = pictures.dataset().root.file_name().unwrap_or_default();
     let provenance = Provenance {
         dataset: dataset.to_string_lossy().into_owned(),
-        facts: *facts,
+        facts: facts.clone(),
         ..Default::default()
     };
     let page = ModelPage {
@@ -144,7 +144,7 @@ fn of_model(
 ) -> Result<Arc<Site>> {
     let bookmark =
         Bookmark { name: "overview".to_owned(), camera: overview(gaussians), pictures: vec![] };
-    let provenance = Provenance { facts: *facts, ..Provenance::default() };
+    let provenance = Provenance { facts: facts.clone(), ..Provenance::default() };
     let page =
         ModelPage { bookmarks: vec![bookmark], origin: gaussians.origin, ..page(path, provenance) };
     site(page, feed, None)

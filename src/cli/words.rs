@@ -7,7 +7,8 @@ use std::str::FromStr;
 
 use clap::builder::{PossibleValue, StringValueParser, TypedValueParser};
 use clap::{Arg, Command, Error};
-use nightsplat_photographs::tone::{Tone, ToneCurve};
+use nightsplat_core::curves::{CURVE_AUTO, name_of};
+use nightsplat_photographs::tone::ToneCurve;
 
 use crate::results::export::Format;
 use crate::train::{Part, Preset};
@@ -24,7 +25,8 @@ impl<T> NamedValues<T> {
 
 /// The names of all curves.
 pub(super) fn curves<T>() -> NamedValues<T> {
-    NamedValues::new(std::iter::once(Tone::Auto.name()).chain(ToneCurve::ALL.map(ToneCurve::name)))
+    let auto = name_of(CURVE_AUTO);
+    NamedValues::new(std::iter::once(auto).chain(ToneCurve::ALL.map(ToneCurve::name)))
 }
 
 /// The names of all presets.

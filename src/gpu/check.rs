@@ -20,6 +20,8 @@ pub enum Tolerance {
     Roundings(f64),
     /// A bound for each number; numbers beyond the list are exact.
     Each(Vec<f64>),
+    /// A bound for each word, which holds the bits of a float.
+    Floats(Vec<f64>),
     /// A bound for each number, and after them for both numbers of each word, the lower first; then exact.
     Packed {
         /// Of the whole words.
@@ -31,8 +33,9 @@ pub enum Tolerance {
     },
     /// Two 16-bit floats in a word, each equal to the reference's or adjacent to it.
     Halves,
-    /// Four bytes in a word, each equal to the reference's or adjacent to it.
-    Bytes,
+    /// Numbers without sign in a word, of these widths from the lowest bit on, each equal to the reference's or adjacent
+    /// to it.
+    Fields(&'static [u32]),
     /// One partial sum per workgroup, of which only the total counts: the device chooses the partition.
     Sum(f64),
     /// Integers in groups of `width`, in any order between one of `begins`, which are numbers of groups, and the next.
@@ -175,8 +178,9 @@ pub(super) struct BufferComparison {
 impl Versions<'_> {
     /// `workgroups` is the number of partial sums.
     pub(super) fn compare(&self, tolerance: &Tolerance, workgroups: usize) -> BufferComparison {
+        let is_float = self.is_float || matches!(tolerance, Tolerance::Floats(_));
         let number = |word: u32| {
-            if self.is_float { f64::from(f32::from_bits(word)) } else { f64::from(word) }
+            if is_float { f64::from(f32::from_bits(word)) } else { f64::from(word) }
         };
         if let Tolerance::AnyOrder { width, begins } = tolerance {
             let [device, reference] =
@@ -202,7 +206,9 @@ impl Versions<'_> {
             }
             let packed = match tolerance {
                 Tolerance::Halves => Some(farthest_halves(self.device[i], expected)),
-                Tolerance::Bytes => Some(farthest_bytes(self.device[i], expected)),
+                Tolerance::Fields(widths) => {
+                    Some(farthest_fields(self.device[i], expected, widths))
+                }
                 _ => None,
             };
             if let Some((device, reference)) = packed {
@@ -223,12 +229,14 @@ impl Versions<'_> {
                 Tolerance::Exact
                 | Tolerance::Sum(_)
                 | Tolerance::Halves
-                | Tolerance::Bytes
+                | Tolerance::Fields(_)
                 | Tolerance::AnyOrder { .. } => 0.0,
                 Tolerance::Roundings(n) => n * ROUNDING * reference.abs() + flushed(1),
-                Tolerance::Each(bounds) | Tolerance::Packed { numbers: bounds, .. } => bounds
+                Tolerance::Each(bounds)
+                | Tolerance::Floats(bounds)
+                | Tolerance::Packed { numbers: bounds, .. } => bounds
                     .get(i)
-                    .map_or(0.0, |bound| bound + if self.is_float { flushed(1) } else { 0.0 }),
+                    .map_or(0.0, |bound| bound + if is_float { flushed(1) } else { 0.0 }),
             };
             comparison.add(i, device, reference, bound);
         }
@@ -248,11 +256,18 @@ fn in_order(words: &[u32], width: usize, begins: &[usize]) -> Vec<u32> {
     sorted
 }
 
-/// Of two words with four bytes each, the pair of bytes that is farther apart.
-fn farthest_bytes(device: u32, reference: u32) -> (f64, f64) {
-    let pairs = device.to_le_bytes().into_iter().zip(reference.to_le_bytes());
-    let farthest = pairs.max_by_key(|(device, reference)| device.abs_diff(*reference));
-    farthest.map_or((0.0, 0.0), |(device, reference)| (device.into(), reference.into()))
+/// Of two words with fields of these widths, the pair of fields that is farther apart.
+fn farthest_fields(device: u32, reference: u32, widths: &[u32]) -> (f64, f64) {
+    let (mut shift, mut farthest) = (0, (0u32, 0u32));
+    for &width in widths {
+        let [device, reference] =
+            [device, reference].map(|word| word >> shift & ((1 << width) - 1));
+        if device.abs_diff(reference) > farthest.0.abs_diff(farthest.1) {
+            farthest = (device, reference);
+        }
+        shift += width;
+    }
+    (farthest.0.into(), farthest.1.into())
 }
 
 /// Of two words with two halves each, the pair of halves that is farther apart, by index among all halves.

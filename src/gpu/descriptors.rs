@@ -60,25 +60,20 @@ impl Sets {
         params: &[u8],
         bound: &[Bound],
     ) -> Result<()> {
-        let infos: Vec<_> = bound
-            .iter()
-            .map(|&Bound { raw, offset, size }| {
-                let info = vk::DescriptorBufferInfo::default().buffer(raw).offset(offset);
-                [info.range(whole_quads(size))]
-            })
-            .collect();
-        let mut writes: Vec<_> = pipeline
-            .interface
-            .bindings
-            .iter()
-            .zip(&infos)
-            .map(|(binding, info)| {
-                vk::WriteDescriptorSet::default()
-                    .dst_binding(binding.index)
-                    .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
-                    .buffer_info(info)
-            })
-            .collect();
+        let mut infos = [[vk::DescriptorBufferInfo::default()]; MAX_BUFFERS as usize];
+        for (info, &Bound { raw, offset, size }) in infos.iter_mut().zip(bound) {
+            let buffer = vk::DescriptorBufferInfo::default().buffer(raw).offset(offset);
+            *info = [buffer.range(whole_quads(size))];
+        }
+        let mut writes = [vk::WriteDescriptorSet::default(); MAX_BUFFERS as usize];
+        let bindings = pipeline.interface.bindings;
+        for ((write, info), binding) in writes.iter_mut().zip(&infos).zip(bindings) {
+            *write = vk::WriteDescriptorSet::default()
+                .dst_binding(binding.index)
+                .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
+                .buffer_info(info);
+        }
+        let writes = &mut writes[..bindings.len()];
         let (point, layout) = (vk::PipelineBindPoint::COMPUTE, pipeline.layout);
         let shared = Arc::clone(&self.shared);
         let device = &shared.device;
@@ -87,12 +82,12 @@ impl Sets {
             device.cmd_bind_pipeline(commands, point, pipeline.raw);
             match &shared.descriptors {
                 Descriptors::Pushed(functions) => {
-                    functions.cmd_push_descriptor_set(commands, point, layout, 0, &writes);
+                    functions.cmd_push_descriptor_set(commands, point, layout, 0, writes);
                 }
                 Descriptors::InSets => {
                     let set = self.next(pipeline.set_layout)?;
                     writes.iter_mut().for_each(|write| write.dst_set = set);
-                    device.update_descriptor_sets(&writes, &[]);
+                    device.update_descriptor_sets(writes, &[]);
                     device.cmd_bind_descriptor_sets(commands, point, layout, 0, &[set], &[]);
                 }
             }

@@ -89,10 +89,16 @@ impl ImageState {
 #[allow(missing_docs, reason = "the names are Vulkan's")]
 pub enum ImageFormat {
     Rgba16Float,
+    Rgba32Float,
+    B10G11R11Float,
     Rgba8Unorm,
     Rgba8Srgb,
     Bgra8Unorm,
     Bgra8Srgb,
+    A2B10G10R10Unorm,
+    A2R10G10B10Unorm,
+    Rg16Float,
+    Rg32Float,
     R32Float,
     D32Float,
     D32FloatS8,
@@ -102,12 +108,18 @@ pub enum ImageFormat {
 }
 
 /// With Vulkan's constant and the bytes of a copied pixel.
-const FORMATS: [(ImageFormat, vk::Format, usize); 11] = [
+const FORMATS: [(ImageFormat, vk::Format, usize); 17] = [
     (ImageFormat::Rgba16Float, vk::Format::R16G16B16A16_SFLOAT, 8),
+    (ImageFormat::Rgba32Float, vk::Format::R32G32B32A32_SFLOAT, 16),
+    (ImageFormat::B10G11R11Float, vk::Format::B10G11R11_UFLOAT_PACK32, 4),
     (ImageFormat::Rgba8Unorm, vk::Format::R8G8B8A8_UNORM, 4),
     (ImageFormat::Rgba8Srgb, vk::Format::R8G8B8A8_SRGB, 4),
     (ImageFormat::Bgra8Unorm, vk::Format::B8G8R8A8_UNORM, 4),
     (ImageFormat::Bgra8Srgb, vk::Format::B8G8R8A8_SRGB, 4),
+    (ImageFormat::A2B10G10R10Unorm, vk::Format::A2B10G10R10_UNORM_PACK32, 4),
+    (ImageFormat::A2R10G10B10Unorm, vk::Format::A2R10G10B10_UNORM_PACK32, 4),
+    (ImageFormat::Rg16Float, vk::Format::R16G16_SFLOAT, 4),
+    (ImageFormat::Rg32Float, vk::Format::R32G32_SFLOAT, 8),
     (ImageFormat::R32Float, vk::Format::R32_SFLOAT, 4),
     (ImageFormat::D32Float, vk::Format::D32_SFLOAT, 4),
     (ImageFormat::D32FloatS8, vk::Format::D32_SFLOAT_S8_UINT, 4),

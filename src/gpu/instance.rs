@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use ash::{ext, khr, vk};
 
-use super::validation;
+use super::{address_space, validation};
 use crate::{Error, Result};
 
 /// What to install where Vulkan is missing, loader or driver.
@@ -54,6 +54,10 @@ impl OwnedInstance {
 }
 
 pub(super) fn loader_error(result: vk::Result) -> Error {
+    // What has no memory to start says nothing else.
+    if let Err(limit) = address_space::check() {
+        return limit;
+    }
     match result {
         // The loader's answer where there is no driver.
         vk::Result::ERROR_INCOMPATIBLE_DRIVER => no_device(),

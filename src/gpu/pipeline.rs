@@ -4,6 +4,7 @@ use std::io::Cursor;
 use std::sync::Arc;
 
 use ash::vk;
+use nightsplat_core::watch::Stage;
 
 use super::{
     Gpu, GpuShared, Interface, Kernel, Properties, Retired, Statistic, reconvergence, spirv,
@@ -58,6 +59,7 @@ impl Gpu {
         constants: Vec<(u32, u32)>,
     ) -> Result<Objects> {
         let _phase = tracing::info_span!("pipelines").entered();
+        Stage::begin("compiling kernels", 1).next()?;
         let shared = &self.shared;
         let fail = |call| move |result| shared.error(call, result);
         let name = described(interface, &constants);

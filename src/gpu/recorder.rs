@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 use std::ffi::CString;
+use std::hash::{BuildHasherDefault, Hasher};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
@@ -46,7 +47,7 @@ pub struct Recorder<'g> {
     /// Each pass with the bytes of the buffers that it binds.
     pub(super) labels: Vec<(&'static str, u64)>,
     /// Buffers accessed since the last barrier; true if written.
-    pending: HashMap<vk::Buffer, bool>,
+    pending: HashMap<vk::Buffer, bool, BuildHasherDefault<HandleHasher>>,
     /// The stages outside this recording that read our buffers, before it or after it.
     readers: vk::PipelineStageFlags2,
     /// The passes being recorded write different parts of the same buffers.
@@ -87,6 +88,24 @@ pub(super) type ReferenceOf<'a> = dyn Fn(&mut [Vec<u32>], &mut [Vec<u32>]) -> Ve
 
 /// The timeline value of a recording that the host application submits: none of ours.
 pub(super) const HOST_SUBMITS: u64 = 0;
+
+/// Spreads the bits of handles, which are distinct already; several are looked up for each pass.
+#[derive(Debug, Default)]
+struct HandleHasher(u64);
+
+impl Hasher for HandleHasher {
+    fn write(&mut self, bytes: &[u8]) {
+        bytes.iter().for_each(|&byte| self.write_u64(byte.into()));
+    }
+
+    fn write_u64(&mut self, handle: u64) {
+        self.0 = (self.0 ^ handle).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    }
+
+    fn finish(&self) -> u64 {
+        self.0.rotate_left(26)
+    }
+}
 
 /// Timestamps of one recording; later passes are not timed.
 pub(super) const MAX_TIMESTAMPS: u32 = 4096;
@@ -149,7 +168,7 @@ impl<'g> Recorder<'g> {
             value: HOST_SUBMITS,
             timestamps: None,
             labels: vec![],
-            pending: HashMap::new(),
+            pending: HashMap::default(),
             readers,
             is_concurrent: false,
             observer: None,

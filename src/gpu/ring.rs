@@ -51,6 +51,11 @@ impl Recorder<'_> {
 }
 
 impl Ring {
+    /// The place of the next recording in their order.
+    pub(crate) fn number(&self) -> u64 {
+        self.next as u64
+    }
+
     /// The words of the newest recording that is done.
     pub(crate) fn newest(&self) -> Option<RingEntry> {
         let shared = &self.memory.shared;

@@ -92,9 +92,9 @@ impl<'a, T: bytemuck::Pod> Slice<'a, T> {
         }
     }
 
-    /// Whether both begin at the same element of the same buffer.
-    pub(crate) fn begins_with(&self, other: &Self) -> bool {
-        std::ptr::eq(self.memory, other.memory) && self.first == other.first
+    /// Where it begins: a number of the buffer, and the element.
+    pub(crate) fn begin(&self) -> (usize, usize) {
+        (std::ptr::from_ref(self.memory).addr(), self.first)
     }
 
     /// The name of the buffer.

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use glam::DVec3;
 use hyper::body::Bytes;
 use nightsplat_core::camera::CameraModel;
+use nightsplat_core::natural;
 use nightsplat_photographs::dataset::{Dataset, LoadOptions, MeasuredSize, View};
 use nightsplat_photographs::image::{Image, ImageFile};
 use nightsplat_photographs::tone::ToneCurve;
@@ -110,7 +111,10 @@ impl Pictures {
                 pictures: kinds.map(picture).collect(),
             }
         };
-        self.dataset.views.iter().enumerate().map(bookmark).collect()
+        let mut bookmarks: Vec<Bookmark> =
+            self.dataset.views.iter().enumerate().map(bookmark).collect();
+        bookmarks.sort_by(|a, b| natural::compare(&a.name, &b.name));
+        bookmarks
     }
 
     fn has(&self, view: &View, kind: Kind) -> bool {

@@ -19,11 +19,11 @@ const LARGEST: f64 = 3200.0 * 2400.0;
 /// Seconds of features, matching and cameras of these photographs on this machine.
 pub(super) fn seconds(pictures: &PosePhotographs, matcher: Matcher) -> [f64; 3] {
     let count = pictures.dark.len() + pictures.bright.len();
-    of(count, pictures.dark.first().map(PathBuf::as_path), matcher)
+    seconds_of(count, pictures.dark.first().map(PathBuf::as_path), matcher)
 }
 
 /// [`seconds`] of as many photographs as the first.
-pub(super) fn of(count: usize, first: Option<&Path>, matcher: Matcher) -> [f64; 3] {
+pub(super) fn seconds_of(count: usize, first: Option<&Path>, matcher: Matcher) -> [f64; 3] {
     let pixels = first.and_then(|first| Image::size_of(first).ok());
     let pixels = pixels.map_or(12e6, |(width, height)| f64::from(width) * f64::from(height));
     let (count, megapixels) = (count as f64, pixels.min(LARGEST) / 1e6);

@@ -57,11 +57,12 @@ fn write(mask: Option<Mask>, path: &Path) -> Result<()> {
     mask.to_image().save_png8(path)
 }
 
-/// What `train` masks unasked, and what shows only in the tone-mapped copies.
+/// What `train` masks unasked, and what shows only in the tone-mapped copies, however dim.
 fn find(pictures: &PosePhotographs, photographs: &[PathBuf]) -> Borders {
     let options = LoadOptions::default();
     let stored = Borders::of_files(photographs.iter().map(PathBuf::as_path), &options);
     let copies: Vec<PathBuf> = photographs.iter().map(|path| pictures.copy(path)).collect();
     let options = LoadOptions { mask_borders: false, ..options };
-    stored.joined(Borders::of_files(copies.iter().map(PathBuf::as_path), &options))
+    let copies = || copies.iter().map(PathBuf::as_path);
+    stored.joined(Borders::of_files(copies(), &options)).joined(Borders::still_in(copies()))
 }

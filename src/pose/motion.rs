@@ -18,7 +18,8 @@ const LEAST_OF_CLIP: (usize, f64) = (20, 8.0);
 pub(super) fn at_rest(copies: &[PathBuf]) -> Option<String> {
     let every = copies.len().div_ceil(COMPARED).max(1);
     // The last one is as far from the first as any.
-    let compared = copies.iter().step_by(every).chain(copies.last());
+    let last = copies.last().filter(|_| copies.len() > 1);
+    let compared = copies.iter().step_by(every).chain(last);
     let thumbnails: Vec<Vec<f64>> = compared.filter_map(|copy| thumbnail(copy)).collect();
     let (first, others) = thumbnails.split_first()?;
     let is_same = |other: &Vec<f64>| correlation(first, other) > SAME;

@@ -9,12 +9,12 @@ use nightsplat_photographs::image::files::photographs_in;
 use super::PoseOptions;
 
 /// The line of these options, with a checksum of names, sizes and times of all files.
-pub(super) fn of(options: &PoseOptions) -> String {
+pub(super) fn line(options: &PoseOptions) -> String {
     let PoseOptions { photos, with, matcher, mapper, camera_model, fps, light, .. } = options;
     let mut hasher = Hasher::default();
     let mut count = 0;
-    for place in [Some(photos), with.as_ref()].into_iter().flatten() {
-        for folder in [place.clone(), place.join("masks")] {
+    for folder in [Some(photos), with.as_ref()].into_iter().flatten() {
+        for folder in [folder.clone(), folder.join("masks")] {
             let files = photographs_in(&folder).unwrap_or_else(|_| vec![folder]);
             for file in files {
                 count += usize::from(add(&mut hasher, &file));

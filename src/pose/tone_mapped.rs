@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use nightsplat_core::output::create_folder;
 use nightsplat_photographs::image::files::stem;
 use nightsplat_photographs::image::{
-    ColourCounts, Image, ImageFile, Levels, PictureFile, StoredLight, exif_segment,
+    ColourCounts, ImageFile, Levels, PictureFile, StoredLight, exif_segment, reduced_size,
 };
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
@@ -47,8 +47,11 @@ pub(super) fn write(
         if stopped.is_err() {
             return true;
         }
-        match Image::load_counted(path, &colours) {
-            Ok(image) => measured.push(MeasuredPhotograph::measure(&image.data)),
+        // A large one is reduced for its statistics.
+        let picture =
+            PictureFile::open(path).map(|file| file.reduced(|size| reduced_size(size, (1, 1))));
+        match picture.and_then(|file| file.decode_counted(&colours)) {
+            Ok((image, _)) => measured.push(MeasuredPhotograph::measure(&image.data)),
             Err(error) => {
                 tracing::warn!("left out: {error}");
                 undecoded = Some(error);

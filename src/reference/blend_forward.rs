@@ -58,7 +58,7 @@ impl TileList {
     }
 
     /// The last channel of a splat, which is its depth in the view.
-    fn depth(&self, index: usize) -> f64 {
+    pub(super) fn depth(&self, index: usize) -> f64 {
         let channels = self.colors.len() / self.splats.len();
         self.colors[channels * index + channels - 1]
     }
@@ -139,7 +139,7 @@ fn takes_median(params: &Params, constants: &Constants) -> bool {
 }
 
 /// The depth at which the transmittance passes 1/2, and whether a rounding of it decides.
-fn median(list: &TileList, fragments: &[Fragment], error: f64) -> (f64, bool) {
+pub(super) fn median(list: &TileList, fragments: &[Fragment], error: f64) -> (f64, bool) {
     let after = |fragment: &Fragment| fragment.before * (1.0 - fragment.alpha);
     let passing = fragments.iter().find(|&fragment| after(fragment) <= 0.5);
     let is_fragile = fragments.iter().any(|fragment| (after(fragment) - 0.5).abs() <= error);

@@ -1,12 +1,13 @@
 //! The camera of `include/camera.glsl`, in f64.
 
 pub mod fisheye;
+mod orthographic;
 pub mod pinhole;
 
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::kernels;
-use crate::kernels::camera::CAMERA_FISHEYE;
+use crate::kernels::camera::{CAMERA_FISHEYE, CAMERA_ORTHOGRAPHIC};
 
 use fisheye::Fisheye;
 use pinhole::Pinhole;
@@ -35,6 +36,8 @@ pub enum ReferenceLens {
     Pinhole(Pinhole),
     /// `include/camera_fisheye.glsl`
     Fisheye(Fisheye),
+    /// `include/camera_orthographic.glsl`
+    Orthographic,
 }
 
 /// The projection of a point, in units of the focal lengths.
@@ -55,6 +58,7 @@ impl From<&kernels::Camera> for ReferenceCamera {
                 distortion: camera.distortion.map(f64::from),
                 largest_angle: camera.largest_angle.into(),
             }),
+            CAMERA_ORTHOGRAPHIC => ReferenceLens::Orthographic,
             _ => ReferenceLens::Pinhole(Pinhole {
                 min_slope: camera.min_slope.as_dvec2(),
                 max_slope: camera.max_slope.as_dvec2(),
@@ -82,10 +86,18 @@ impl ReferenceCamera {
         -(self.rotation.inverse() * self.translation)
     }
 
+    /// The direction in which a point of the world is seen, of any length.
+    pub fn direction(&self, point: DVec3) -> DVec3 {
+        match &self.model {
+            ReferenceLens::Orthographic => self.rotation.row(2),
+            _ => point - self.center(),
+        }
+    }
+
     /// The depth of a point in view coordinates; not positive if the model does not see it.
     pub fn depth(&self, point: DVec3) -> f64 {
         match &self.model {
-            ReferenceLens::Pinhole(_) => point.z,
+            ReferenceLens::Pinhole(_) | ReferenceLens::Orthographic => point.z,
             ReferenceLens::Fisheye(fisheye) => fisheye.depth(point),
         }
     }
@@ -105,23 +117,25 @@ impl ReferenceCamera {
         match &self.model {
             ReferenceLens::Pinhole(pinhole) => pinhole.image_point(point),
             ReferenceLens::Fisheye(fisheye) => fisheye.image_point(point),
+            ReferenceLens::Orthographic => orthographic::image_point(point),
         }
     }
 
-    /// The gradient of the point, from those of its pixel and of the rows of [`ReferenceCamera::jacobian`].
+    /// The gradient of the point; an orthographic camera has none. From those of its pixel and of the rows of [`ReferenceCamera::jacobian`].
     pub fn backward(&self, point: DVec3, d_pixel: DVec2, d_rows: [DVec3; 2]) -> DVec3 {
         let d_place = self.focal * d_pixel;
         let d_rows = [self.focal.x * d_rows[0], self.focal.y * d_rows[1]];
         match &self.model {
             ReferenceLens::Pinhole(pinhole) => pinhole.backward(point, d_place, d_rows),
             ReferenceLens::Fisheye(fisheye) => fisheye.backward(point, d_place, d_rows),
+            ReferenceLens::Orthographic => DVec3::ZERO,
         }
     }
 
     /// The first-order change of depth between a point and another at an offset.
     pub(super) fn depth_change(&self, point: DVec3, offset: DVec3) -> f64 {
         match &self.model {
-            ReferenceLens::Pinhole(_) => offset.z,
+            ReferenceLens::Pinhole(_) | ReferenceLens::Orthographic => offset.z,
             ReferenceLens::Fisheye(_) => point.dot(offset) / point.length(),
         }
     }
@@ -129,7 +143,9 @@ impl ReferenceCamera {
     /// The point moved to another depth.
     pub(super) fn at_depth(&self, point: DVec3, depth: f64) -> DVec3 {
         match &self.model {
-            ReferenceLens::Pinhole(_) => point.truncate().extend(depth),
+            ReferenceLens::Pinhole(_) | ReferenceLens::Orthographic => {
+                point.truncate().extend(depth)
+            }
             ReferenceLens::Fisheye(_) => point * (depth / point.length()),
         }
     }

@@ -19,6 +19,9 @@ fn nearness(params: &Params, depth: f32) -> f64 {
 /// The depth in the view of this nearness.
 fn view_depth(params: &Params, nearness: f64) -> f64 {
     let (near, far) = (f64::from(params.near), f64::from(params.far));
+    if params.is_orthographic != 0 {
+        return far - nearness * (far - near);
+    }
     if far > 0.0 { near * far / (near + nearness * (far - near)) } else { near / nearness }
 }
 
@@ -53,7 +56,8 @@ impl Reference for Kernel {
                 return f64::INFINITY;
             }
             let z = |e: f64| view_depth(params, e);
-            (z(e - error) - z(e + error)).abs() + 12.0 * unit * z(e).abs()
+            let size = z(e).abs().max(f64::from(params.far) * f64::from(params.is_orthographic));
+            (z(e - error) - z(e + error)).abs() + 12.0 * unit * size
         };
         Tolerances { limits: (0..params.pixel_count as usize).map(bound).collect() }
     }

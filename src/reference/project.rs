@@ -83,7 +83,7 @@ pub fn project_gaussian(
     let level = 2.002 * (255.0 * opacity).ln() + 1e-3;
     let half_extent = DVec2::new((level * cov2d.x).sqrt(), (level * cov2d.z).sqrt()) + 0.01;
 
-    let basis = sh_basis(sh_degree, (gaussian.mean - camera.center()).normalize());
+    let basis = sh_basis(sh_degree, camera.direction(gaussian.mean).normalize());
     let color: DVec3 = gaussian.sh.iter().zip(basis).map(|(&c, b)| b * c).sum();
     let color = if raw_colors { color } else { color + 0.5 };
     let color = lamp.map_or(color, |lamp| lamp.lit(color, mean_in_view));

@@ -99,15 +99,6 @@ impl Rounded {
         (self.value - limit).abs() <= self.error
     }
 
-    /// ln x: three ulp, or 2^-21 between a half and two.
-    pub(super) fn ln(self) -> Self {
-        let (low, value) = (self.value - self.error, self.value.ln());
-        let is_near_one = (0.5..=2.0).contains(&self.value);
-        let logarithm = if is_near_one { 1.0 / 2_097_152.0 } else { 6.0 * UNIT * value.abs() };
-        let argument = if self.error == 0.0 { 0.0 } else { (self.value / low.max(0.0)).ln() };
-        Self { value, error: logarithm + argument }
-    }
-
     /// The error of a reference in double precision that is rounded at its end.
     pub(super) fn bound(self) -> f64 {
         self.error + UNIT * self.value.abs()
@@ -276,6 +267,15 @@ impl Real for Rounded {
         }
         let exponential = UNIT * (6.0 + 4.0 * self.value.abs()) * (-self.value).exp();
         Self { error: argument.error + exponential, ..argument }.rounded(1.0)
+    }
+
+    /// ln x: three ulp, or 2^-21 between a half and two.
+    fn ln(self) -> Self {
+        let (low, value) = (self.value - self.error, self.value.ln());
+        let is_near_one = (0.5..=2.0).contains(&self.value);
+        let logarithm = if is_near_one { 1.0 / 2_097_152.0 } else { 6.0 * UNIT * value.abs() };
+        let argument = if self.error == 0.0 { 0.0 } else { (self.value / low.max(0.0)).ln() };
+        Self { value, error: logarithm + argument }
     }
 
     /// A series if x is small, else ln(1 + x).

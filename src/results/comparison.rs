@@ -1,8 +1,10 @@
-//! Runs on one dataset, compared view by view.
+//! Runs on one dataset, and renders of other programs, compared view by view.
 
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
-use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_core::natural;
+use nightsplat_photographs::dataset::{Dataset, View, ViewPictures};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::metrics::Scores;
 use serde_json::{Value, json};
@@ -11,8 +13,9 @@ use super::eval::{After, Evaluation, Extras, Metric, ScoreReference, ScoredImage
 use super::finished_run::{FinishedRun, Opener, is_model};
 use super::report::{Best, Column, Comparison, NumberTable, Picture, Report, TextTable};
 use super::run;
+use crate::gpu::Gpu;
 use crate::networks::lpips::{Lpips, LpipsVersion, Range};
-use crate::train::{TrainConfig, values};
+use crate::train::{Rendered, TrainConfig, values};
 use crate::{Error, Result};
 
 /// Maximum width of an image, pixels.
@@ -22,13 +25,13 @@ const SHOWN: usize = 12;
 /// Cameras whose poses differ by more, relative to their distance from the origin, are of different datasets.
 const POSE_ERROR: f64 = 1e-6;
 
-/// A run that is compared.
+/// A run that is compared, or the renders of another program.
 #[derive(Debug)]
 struct Compared {
     name: String,
     evaluation: Evaluation,
-    gaussians: usize,
-    /// `metrics.json`; null of a model.
+    gaussians: Option<usize>,
+    /// `metrics.json`; null of a model and of renders.
     metrics: Value,
     config: Option<TrainConfig>,
 }
@@ -41,14 +44,44 @@ pub(crate) struct RunComparison {
     pictures: Vec<Comparison>,
 }
 
+/// The renders of another program: pictures of the test views by their names.
+#[derive(Clone, Debug)]
+pub struct NamedRenders {
+    pub(crate) name: String,
+    pub(crate) folder: PathBuf,
+}
+
+impl NamedRenders {
+    /// Those of one of several scenes, which have a folder each.
+    pub(crate) fn of_scene(&self, scene: &str) -> Self {
+        Self { name: self.name.clone(), folder: self.folder.join(scene) }
+    }
+}
+
+impl FromStr for NamedRenders {
+    type Err = Error;
+
+    /// Reads `NAME=DIR`.
+    fn from_str(text: &str) -> Result<Self> {
+        let parts = text.split_once('=').filter(|(name, dir)| !name.is_empty() && !dir.is_empty());
+        let (name, folder) = parts
+            .ok_or_else(|| Error::Usage(format!("`{text}` names no renders; write NAME=DIR")))?;
+        Ok(Self { name: name.to_owned(), folder: folder.into() })
+    }
+}
+
 /// The options of a comparison.
 #[derive(Debug)]
 pub(crate) struct CompareOptions<'a> {
+    /// Renders of other programs, in addition to the runs.
+    pub(crate) renders: &'a [NamedRenders],
     pub(crate) dataset: Option<&'a Path>,
     pub(crate) opener: Opener,
     pub(crate) lpips: Option<(&'a Path, Range)>,
     /// Whether images are kept.
     pub(crate) with_pictures: bool,
+    /// Whether a bright model may be scored against dark photographs.
+    pub(crate) photographs: bool,
 }
 
 impl RunComparison {
@@ -56,16 +89,30 @@ impl RunComparison {
     /// first run.
     pub(crate) fn new(paths: &[PathBuf], options: &CompareOptions<'_>) -> Result<Self> {
         let names = names(paths);
-        let mut first: Option<(Dataset, ScoreReference)> = None;
+        let mut first: Option<(Gpu, Dataset, ScoreReference)> = None;
         let mut comparison = Self { runs: vec![], measure: None, pictures: vec![] };
+        let mut targets = None;
         for (path, name) in paths.iter().zip(names) {
+            // Of a model file, the views are those of the first.
+            let stated: Option<String> = targets.clone().filter(|_| is_model(path));
+            let change = |config: &mut TrainConfig| {
+                let changed = stated.and_then(|stated| config.with_targets(&stated).ok());
+                *config = changed.unwrap_or_else(|| config.clone());
+            };
+            let opened = FinishedRun::open_lit(path, options.dataset, &options.opener, change)?;
+            let states_targets = opened.states_targets;
             let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, .. } =
-                FinishedRun::open_lit(path, options.dataset, &options.opener)?;
+                opened;
             if first.is_none() {
                 let reference = ScoreReference::new(&gpu, &config.tone, &dataset)?;
-                first = Some((dataset.clone(), reference));
+                if !states_targets && !options.photographs {
+                    reference
+                        .check_brightness(path, &dataset, |view| model_renderer.render(view))?;
+                }
+                targets = config.stated_targets();
+                first = Some((gpu.clone(), dataset.clone(), reference));
             }
-            let Some((first_dataset, reference)) = &mut first else { continue };
+            let Some((_, first_dataset, reference)) = &mut first else { continue };
             if let Some(difference) = difference(first_dataset, &dataset) {
                 let problem = format!(
                     "{} and {name} are runs of different datasets: {difference}; compare runs of one",
@@ -73,34 +120,56 @@ impl RunComparison {
                 );
                 return Err(Error::Usage(problem));
             }
-            let lpips = options.lpips.map(|(weights, range)| Lpips::load(&gpu, weights, range));
-            let lpips = lpips.transpose()?;
-            comparison.measure = lpips.as_ref().map(Lpips::measure);
-            let step = reference.view_count(&dataset).div_ceil(SHOWN).max(1);
-            let mut number = 0;
             let is_even = reference.is_evenly_lit(&dataset);
             let render = |view: &View| model_renderer.render_as(view, is_even);
-            let pictures = &mut comparison.pictures;
-            let keep = |images: &ScoredImages<'_>| {
-                if options.with_pictures && number % step == 0 {
-                    add(pictures, number / step, &name, images);
-                }
-                number += 1;
-                Ok(())
-            };
-            let lpips = lpips.as_ref().map(|lpips| (lpips, &gpu));
-            let extras = Extras { lpips, ..Extras::default() };
-            let evaluation = Evaluation::new(reference, &dataset, &extras, render, keep)?;
+            let scored = (&gpu, &dataset, reference);
+            let evaluation = comparison.evaluate(&name, scored, options, render)?;
             let is_run = !is_model(path);
             comparison.runs.push(Compared {
                 name,
                 evaluation,
-                gaussians: gaussian_count,
+                gaussians: Some(gaussian_count),
                 metrics: if is_run { run::load_metrics(path) } else { Value::Null },
                 config: is_run.then_some(config),
             });
         }
+        for NamedRenders { name, folder } in options.renders {
+            let Some((gpu, dataset, reference)) = &mut first else { break };
+            let pictures = ViewPictures::of_tests(folder, dataset)?;
+            let render = |view: &View| pictures.load(view).map(Rendered::from);
+            let evaluation =
+                comparison.evaluate(name, (&*gpu, &*dataset, reference), options, render)?;
+            let (name, metrics) = (name.clone(), Value::Null);
+            let compared = Compared { name, evaluation, gaussians: None, metrics, config: None };
+            comparison.runs.push(compared);
+        }
         Ok(comparison)
+    }
+
+    /// Scores the test views of a run or of renders, and keeps images of some.
+    fn evaluate(
+        &mut self,
+        name: &str,
+        (gpu, dataset, reference): (&Gpu, &Dataset, &mut ScoreReference),
+        options: &CompareOptions<'_>,
+        render: impl FnMut(&View) -> Result<Rendered>,
+    ) -> Result<Evaluation> {
+        let lpips = options.lpips.map(|(weights, range)| Lpips::load(gpu, weights, range));
+        let lpips = lpips.transpose()?;
+        self.measure = lpips.as_ref().map(Lpips::measure);
+        let step = reference.view_count(dataset).div_ceil(SHOWN).max(1);
+        let mut number = 0;
+        let pictures = &mut self.pictures;
+        let keep = |images: &ScoredImages<'_>| {
+            if options.with_pictures && number % step == 0 {
+                add(pictures, number / step, name, images);
+            }
+            number += 1;
+            Ok(())
+        };
+        let lpips = lpips.as_ref().map(|lpips| (lpips, gpu));
+        let extras = Extras { lpips, ..Extras::default() };
+        Evaluation::new(reference, dataset, &extras, render, keep)
     }
 
     /// The runs with their mean scores.
@@ -123,7 +192,7 @@ impl RunComparison {
                 vec![mean(Metric::Psnr), mean(Metric::PsnrChannelMean), mean(Metric::Ssim)];
             values.extend(self.measure.map(|_| mean(Metric::Lpips)));
             values.extend([
-                Some(run.gaussians as f64),
+                run.gaussians.map(|count| count as f64),
                 run.metrics["steps"].as_f64(),
                 run.metrics["seconds"].as_f64(),
             ]);
@@ -134,6 +203,7 @@ impl RunComparison {
             label: "run".to_owned(),
             columns,
             rows: self.runs.iter().map(row).collect(),
+            ..NumberTable::default()
         }
     }
 
@@ -147,6 +217,8 @@ impl RunComparison {
         let psnr = |run: &Compared, view: &str| {
             run.evaluation.value(Some(view), Metric::Psnr, After::Model)
         };
+        let mut views = first.evaluation.views();
+        views.sort_by(|a, b| natural::compare(a, b));
         let row = |view: &str| {
             let of_first = psnr(first, view);
             let gain = |run: &Compared| Some(psnr(run, view)? - of_first?);
@@ -157,7 +229,8 @@ impl RunComparison {
             title: "Test views".to_owned(),
             label: "view".to_owned(),
             columns,
-            rows: first.evaluation.views().into_iter().map(row).collect(),
+            rows: views.into_iter().map(row).collect(),
+            ..NumberTable::default()
         }
     }
 
@@ -165,7 +238,9 @@ impl RunComparison {
     pub(crate) fn settings(&self) -> Vec<[String; 2]> {
         let all: Vec<_> =
             self.runs.iter().filter_map(|run| values(run.config.as_ref()?).ok()).collect();
-        let Some(first) = all.first().filter(|_| all.len() == self.runs.len()) else {
+        // Renders have no settings, and models few.
+        let with_settings = self.runs.iter().filter(|run| run.gaussians.is_some()).count();
+        let Some(first) = all.first().filter(|_| all.len() == with_settings) else {
             return vec![];
         };
         let mut keys: Vec<&String> = all.iter().flat_map(|settings| settings.keys()).collect();
@@ -190,9 +265,9 @@ impl RunComparison {
 
     pub(crate) fn json(&self) -> Value {
         let entry = |run: &Compared| {
-            let steps = run.metrics["steps"].as_u64().unwrap_or_default();
+            let of_model = run.gaussians.map(|_| run.metrics["steps"].as_u64().unwrap_or_default());
             let seconds = run.metrics["seconds"].as_f64();
-            let mut metrics = run.evaluation.json(seconds, run.gaussians, Some(steps));
+            let mut metrics = run.evaluation.json(seconds, run.gaussians, of_model);
             metrics["run"] = json!(run.name);
             metrics
         };
@@ -202,9 +277,11 @@ impl RunComparison {
 
     pub(crate) fn html(&self) -> String {
         let names: Vec<&str> = self.runs.iter().map(|run| run.name.as_str()).collect();
+        let of_runs = self.runs.iter().filter(|run| run.gaussians.is_some());
+        let of_runs: Vec<&str> = of_runs.map(|run| run.name.as_str()).collect();
         let settings = self.settings();
         let facts = (!settings.is_empty()).then(|| TextTable {
-            title: format!("Settings that differ: {}", names.join(" | ")),
+            title: format!("Settings that differ: {}", of_runs.join(" | ")),
             rows: settings,
         });
         // The views on which the runs differ the most come first.

@@ -1,92 +1,125 @@
-//! A diagnosis as a table, as lines and as a page: the plan, measurements, and photographs with their targets.
+//! A diagnosis as a table, as lines and as a page: verdict, plan, photographs with their targets, measurements.
 
+use nightsplat_core::natural;
 use nightsplat_photographs::dataset::{Dataset, View};
-use nightsplat_photographs::image::Image;
 use nightsplat_photographs::scene_tone::SceneTone;
-use nightsplat_photographs::tone::{ToneSettings, luminance};
+use nightsplat_photographs::tone::ToneSettings;
 
 use crate::results::linear_light::target_of;
 use crate::results::report::{
-    Best, Column, Comparison, Distribution, NumberTable, Picture, Report, TextTable, distributions,
+    Best, Column, ContactSheet, Distribution, NumberTable, Report, TextTable, distributions,
 };
+use crate::results::verdict;
 use crate::train::diagnose::{
     ChannelNoise, Diagnosis, LampDiagnosis, Plan, SceneDiagnosis, TargetNoise, ViewDiagnosis,
+    is_blurred, median,
 };
 
-/// Width of an image, pixels.
-const PICTURE_WIDTH: u32 = 240;
-/// Number of views with images, spread evenly.
-const SHOWN: usize = 12;
-
-/// A column of the table of photographs: name, decimals, meaning with its unit, and bad values.
-type Measure = (&'static str, usize, &'static str, &'static str);
+/// A column of the table of photographs: name, decimals, meaning with its unit, bad values in words, and whether a value
+/// is bad, given the median of the column.
+type Measure = (&'static str, usize, &'static str, &'static str, fn(f64, f64) -> bool);
 
 /// The columns, in the order of [`values`].
 const MEASURES: [Measure; 14] = [
-    ("p10", 4, "10th percentile of the encoded luminance, 0 to 1", "0: crushed shadows"),
+    (
+        "p10",
+        4,
+        "10th percentile of the encoded luminance, 0 to 1",
+        "0: crushed shadows",
+        |value, _| value == 0.0,
+    ),
     (
         "p90",
         4,
         "90th percentile of the encoded luminance, 0 to 1",
         "below 0.02: too dark for 8 bits",
+        |value, _| value < 0.02,
     ),
-    ("r", 2, "p10 / p90, 0 to 1", "above 0.7: fog, glare or no texture"),
-    ("mean", 4, "mean encoded luminance, 0 to 1", "above 0.4: not dark"),
+    ("r", 2, "p10 / p90, 0 to 1", "above 0.7: fog, glare or no texture", |value, _| value > 0.7),
+    ("mean", 4, "mean encoded luminance, 0 to 1", "above 0.4: not dark", |value, _| value > 0.4),
     (
         "cubic",
         4,
         "cubic mean of the encoded luminance, 0 to 1",
-        "far above the mean: bright lamps in the dark",
+        "twice the median: bright lamps in the dark",
+        |value, median| value > 2.0 * median,
     ),
     (
         "EV",
         2,
         "stops brighter than other views of the same points",
         "beyond 0.3 either way: learn exposures",
+        |value, _| value.abs() > 0.3,
     ),
     (
         "white %",
         2,
         "values near white, 0.94 and above, %",
         "above 5: detail is lost in lamps or sky",
+        |value, _| value > 5.0,
     ),
-    ("black %", 1, "zero values, %", "above 20: detail is lost in the shadows"),
-    ("codes", 0, "distinct values in use, of 256 for 8 bits", "below 20: banding in the targets"),
+    ("black %", 1, "zero values, %", "above 20: detail is lost in the shadows", |value, _| {
+        value > 20.0
+    }),
+    (
+        "codes",
+        0,
+        "distinct values in use, of 256 for 8 bits",
+        "below 20: banding in the targets",
+        |value, _| value < 20.0,
+    ),
     (
         "luma noise",
         3,
         "standard deviation of the luminance in the target, with JPEG and quantisation noise",
         "above 0.02: visible in the targets",
+        |value, _| value > 0.02,
     ),
     (
         "chroma noise",
         3,
         "standard deviation of the colour differences R - Y and B - Y in the target",
         "above 0.02: visible in the targets",
+        |value, _| value > 0.02,
     ),
-    ("blur", 1, "width of edges, pixels", "1.6 times the median: motion or focus"),
-    ("points", 0, "points that the view sees", "below 12: its pose is doubtful"),
+    ("blur", 1, "width of edges, pixels", "1.6 times the median: motion or focus", is_blurred),
+    ("points", 0, "points that the view sees", "below 12: its pose is doubtful", |value, _| {
+        value < 12.0
+    }),
     (
         "overlap",
         2,
         "share of the view that other views see, 0 to 1",
         "below 0.5: holes and floaters",
+        |value, _| value < 0.5,
     ),
 ];
 
-/// The table of photographs.
+/// The table of photographs, in the order of their names.
 pub(crate) fn table(diagnosis: &Diagnosis) -> NumberTable {
+    let mut views: Vec<&ViewDiagnosis> = diagnosis.views.iter().collect();
+    views.sort_by(|a, b| natural::compare(&a.name, &b.name));
     let column = |(name, digits, ..): &Measure| Column {
         name: (*name).to_owned(),
         digits: *digits,
         best: Best::Unmarked,
     };
-    let row = |view: &ViewDiagnosis| (view.name.clone(), values(view).to_vec());
+    let all: Vec<_> = views.iter().map(|view| values(view)).collect();
+    let bad = MEASURES.iter().enumerate().flat_map(|(column, (.., is_bad))| {
+        let median = median(all.iter().filter_map(|row| row[column]).collect());
+        let is_marked = |row: &&usize| {
+            all[**row][column].zip(median).is_some_and(|(value, median)| is_bad(value, median))
+        };
+        let rows: Vec<usize> = (0..all.len()).collect();
+        rows.iter().filter(is_marked).map(|row| [*row, column]).collect::<Vec<_>>()
+    });
+    let bad = bad.collect();
     NumberTable {
         title: "Training photographs".to_owned(),
         label: "view".to_owned(),
         columns: MEASURES.iter().map(column).collect(),
-        rows: diagnosis.views.iter().map(row).collect(),
+        rows: views.iter().zip(&all).map(|(view, row)| (view.name.clone(), row.to_vec())).collect(),
+        bad,
     }
 }
 
@@ -196,40 +229,48 @@ fn lamp(scene: &SceneDiagnosis) -> String {
     )
 }
 
-/// The page: the plan first, then measurements and photographs.
+/// The page: verdict and plan first, then all photographs, then measurements.
 pub(crate) fn page(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> String {
     let views: Vec<&View> = dataset.train_views().filter(|view| view.has_photograph()).collect();
     let tone = ToneSettings { full_resolution: false, ..ToneSettings::default() };
     let scene = SceneTone::measure(&tone, dataset).ok();
     let (mut dark, mut bright) = (Distribution::new("photographs"), Distribution::new("targets"));
-    let stride = views.len().div_ceil(SHOWN).max(1);
-    let mut comparisons = vec![];
-    for view in views.iter().step_by(stride) {
+    let mut sheet = ContactSheet::new("The photographs, and what they become", views.len());
+    for (index, view) in views.iter().enumerate() {
+        let mark = diagnosis.odd.get(&view.name).map_or("", String::as_str);
+        if !sheet.shows(index, mark) {
+            continue;
+        }
         // A photograph that can no longer be read is skipped.
         let Ok(Some(image)) = view.loaded() else { continue };
-        let image = image.as_ref();
+        let image = sheet.shrunk(&image);
         let curve = scene.as_ref().and_then(|scene| scene.inverse(view).ok());
-        let target = curve.map_or_else(|| image.clone(), |curve| target_of(image, &curve));
+        let target = curve.map_or_else(|| image.clone(), |curve| target_of(&image, &curve));
         dark.add(&image.data);
         bright.add(&target.data);
-        let [shown, target] = [image.clone(), target].map(|image| view.upright(image));
-        comparisons.push(comparison(&view.name, &shown, &target));
+        let [image, target] = [image, target].map(|image| view.upright(image));
+        sheet.add(&view.name, mark, [&image, &target]);
     }
-    let mut intro = vec![format!(
-        "{} photographs to train on ({}), {} held out, {} points.",
-        diagnosis.views.len(),
-        sizes(&diagnosis.views),
-        diagnosis.test_views,
-        dataset.points.len()
-    )];
+    let mut intro = vec![
+        verdict::of_set(diagnosis) + ".",
+        format!(
+            "{} photographs to train on ({}), {} held out, {} points.",
+            diagnosis.views.len(),
+            sizes(&diagnosis.views),
+            diagnosis.test_views,
+            dataset.points.len()
+        ),
+    ];
     intro.extend(diagnosis.remarks.iter().map(|remark| format!("Note: {remark}.")));
     let decided = plan.decisions().into_iter();
     let decided = decided.map(|(part, value, why)| [format!("{part}: {value}"), why.to_owned()]);
-    let meaning =
-        |(name, _, meaning, bad): &Measure| [(*name).to_owned(), format!("{meaning}. Bad: {bad}.")];
+    let meaning = |(name, _, meaning, bad, _): &Measure| {
+        [(*name).to_owned(), format!("{meaning}. Bad: {bad}.")]
+    };
     let facts = |title: &str, rows| TextTable { title: title.to_owned(), rows };
+    let name = dataset.root.file_name().unwrap_or(dataset.root.as_os_str());
     Report {
-        title: format!("Diagnosis of {}", dataset.root.display()),
+        title: format!("Diagnosis of {}", name.to_string_lossy()),
         intro,
         facts: vec![
             facts("The plan", decided.collect()),
@@ -238,41 +279,8 @@ pub(crate) fn page(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
         ],
         tables: vec![table(diagnosis)],
         charts: vec![distributions(&[dark, bright])],
-        comparisons,
+        sheets: vec![sheet],
         ..Report::default()
     }
     .html()
-}
-
-fn comparison(name: &str, image: &Image, target: &Image) -> Comparison {
-    let picture = |caption: &str, image: &Image| {
-        Picture::shrunk(caption, String::new(), image, PICTURE_WIDTH)
-    };
-    let (dark, bright) = (picture("photograph", image), picture("target", target));
-    let (width, height) = (dark.image.width, dark.image.height);
-    let histograms = histogram([&dark.image, &bright.image], width, height);
-    let histograms = picture("luminance before (dark) and after (light)", &histograms);
-    Comparison { title: name.to_owned(), pictures: vec![dark, bright, histograms] }
-}
-
-/// Histograms of luminance before (dark) and after (light).
-fn histogram(of: [&Image; 2], width: u32, height: u32) -> Image {
-    const SHADES: [[f32; 3]; 2] = [[0.18, 0.22, 0.34], [0.85, 0.62, 0.28]];
-    let heights = of.map(|image| {
-        let mut counts = vec![0.0_f64; width as usize];
-        for (x, y) in (0..image.height).flat_map(|y| (0..image.width).map(move |x| (x, y))) {
-            let position = luminance(image.pixel(x, y)).clamp(0.0, 1.0) * (width - 1) as f32;
-            counts[position.round() as usize] += 1.0;
-        }
-        let peak = counts.iter().fold(1.0, |peak: f64, &count| peak.max(count));
-        counts.iter().map(|count| count / peak * f64::from(height)).collect::<Vec<_>>()
-    });
-    Image::from_fn(width, height, |x, y| {
-        let covers = |curve: usize| heights[curve][x as usize] >= f64::from(height - y);
-        match (covers(0), covers(1)) {
-            (true, _) => SHADES[0],
-            (false, true) => SHADES[1],
-            (false, false) => [0.96; 3],
-        }
-    })
 }

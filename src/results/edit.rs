@@ -28,12 +28,17 @@ use self::evidence::Measured;
 use self::floaters::{CameraPositions, Floaters};
 use self::placement::Placement;
 use self::step::Step;
+use crate::results::eval::ScoreReference;
 use crate::results::export::{EDITS, Format, Provenance};
 use crate::results::finished_run::{Opener, is_model};
 use crate::results::{models, run};
 use crate::splats::scene::{Features, Gaussians, ModelFacts, Shape, is_far};
 use crate::{Error, Result};
+use operation::Span;
 pub(crate) use operation::{EditList, Operation, Region, Scale, fingerprint};
+
+/// The rendered weight, in pixels over all training views, from which a Gaussian is shown by them.
+const SHOWN: f64 = 0.01;
 
 /// A model while it is edited.
 pub(crate) struct Editor {
@@ -53,6 +58,16 @@ pub(crate) struct Editor {
     done: Vec<Operation>,
     /// The edit lists in the header of the file.
     earlier: Vec<String>,
+    /// What the test views are scored against, and their PSNR before the first operation that changes renders.
+    score: Option<(ScoreReference, f64)>,
+}
+
+/// The PSNR of the test views, dB.
+pub(crate) struct EditScore {
+    pub(crate) before: f64,
+    pub(crate) after: f64,
+    /// What they are scored against.
+    pub(crate) against: &'static str,
 }
 
 impl Editor {
@@ -70,6 +85,7 @@ impl Editor {
             capture: None,
             done: vec![],
             earlier: earlier_edits(path),
+            score: None,
         })
     }
 
@@ -95,8 +111,13 @@ impl Editor {
         Err(Error::input(path, problem))
     }
 
-    /// Applies an operation and says in a line what it did.
-    pub(crate) fn apply(&mut self, operation: &Operation) -> Result<String> {
+    /// Applies an operation and says in a line what it did. `observe` is called with the rounds that are done of a long
+    /// one, and the most that it has.
+    pub(crate) fn apply(
+        &mut self,
+        operation: &Operation,
+        observe: &dyn Fn(usize, usize),
+    ) -> Result<String> {
         operation.check().map_err(Error::Usage)?;
         if operation.needs_dataset() {
             self.open_capture()?;
@@ -108,7 +129,7 @@ impl Editor {
                 self.step("delete", Step::delete(spans, before)?)?;
                 ("delete".to_owned(), operation.clone())
             }
-            Operation::Floaters => (self.remove_floaters()?, operation.clone()),
+            Operation::Floaters => (self.remove_floaters(observe)?, operation.clone()),
             Operation::OpacityMin(least) => {
                 self.step("opacity-min", Step::OpacityMin(*least))?;
                 (format!("opacity-min {least}"), operation.clone())
@@ -120,7 +141,7 @@ impl Editor {
             }
             Operation::Up(None) => {
                 let up = self.up()?;
-                return self.apply(&Operation::Up(Some(up)));
+                return self.apply(&Operation::Up(Some(up)), observe);
             }
             Operation::Up(_) | Operation::Rotate { .. } => self.rotate(operation)?,
             Operation::Scale(scale) => self.scale(scale)?,
@@ -166,7 +187,7 @@ impl Editor {
         };
         let mut edits = self.earlier.clone();
         edits.push(self.list().line());
-        let facts = self.facts;
+        let facts = self.facts.clone();
         let provenance = Provenance { dataset, curve, facts, edits, ..Provenance::default() };
         create_folder_of(out)?;
         match Format::from_path(out)? {
@@ -188,6 +209,12 @@ impl Editor {
         write_whole(out, list.text().as_bytes())
     }
 
+    /// The dataset that was named, or that of the run.
+    pub(crate) fn dataset_folder(&self) -> Option<PathBuf> {
+        let of_run = || Some(run::load_config(&self.path).ok()?.dataset);
+        self.dataset.clone().or_else(of_run).filter(|folder| folder.is_dir())
+    }
+
     fn open_capture(&mut self) -> Result<&mut ModelPhotographs> {
         if self.capture.is_none() {
             let dataset = self.dataset.as_deref();
@@ -198,32 +225,50 @@ impl Editor {
             .ok_or_else(|| crate::results::finished_run::needs_photographs(&self.path))
     }
 
-    /// Removes floaters, and says the held-out PSNR before and after.
-    fn remove_floaters(&mut self) -> Result<String> {
+    /// Scores the test views before an operation that changes renders, unless that is done, or no photograph tells what
+    /// they are to look like.
+    pub(crate) fn score_before(&mut self) -> Result<()> {
+        if self.score.is_some() || (is_model(&self.path) && self.dataset.is_none()) {
+            return Ok(());
+        }
+        if let Some(mut reference) = self.open_capture()?.score_reference()?
+            && let Some(before) = self.psnr(&mut reference)?
+        {
+            self.score = Some((reference, before));
+        }
+        Ok(())
+    }
+
+    /// The score of the test views before and after all operations, if they were scored before.
+    pub(crate) fn score(&mut self) -> Result<Option<EditScore>> {
+        let Some((mut reference, before)) = self.score.take() else { return Ok(None) };
+        let against = reference.against.name();
+        let after = self.psnr(&mut reference)?;
+        Ok(after.map(|after| EditScore { before, after, against }))
+    }
+
+    /// The mean PSNR of the test views, dB; `None` without any.
+    fn psnr(&self, reference: &mut ScoreReference) -> Result<Option<f64>> {
+        let run = (!is_model(&self.path)).then_some(&*self.path);
+        let Some(capture) = &self.capture else { return Ok(None) };
+        capture.psnr(run, &*self.content.whole()?, &self.facts, &self.placement, reference)
+    }
+
+    /// Removes floaters.
+    fn remove_floaters(&mut self, observe: &dyn Fn(usize, usize)) -> Result<String> {
         self.open_capture()?;
-        let (placement, facts) = (self.placement, self.facts);
-        let run = (!is_model(&self.path)).then(|| self.path.clone());
+        let (placement, facts) = (self.placement, &self.facts);
         let Some(capture) = &self.capture else { return Ok(String::new()) };
-        let mut reference = capture.score_reference()?;
-        let mut psnr = |gaussians: &Gaussians| {
-            capture.psnr(run.as_deref(), gaussians, &facts, &placement, &mut reference)
-        };
-        let measured = |gaussians: &Gaussians| Measured::new(capture, placement, gaussians, &facts);
+        let measured = |gaussians: &Gaussians| Measured::new(capture, placement, gaussians, facts);
         let gaussians = self.content.whole()?;
-        let before = psnr(&gaussians)?;
         let cameras = capture.cameras();
         let positions = cameras.iter().map(|camera| placement.camera(camera).center()).collect();
-        let cameras = CameraPositions { positions, near: capture.near(&facts, &placement) };
+        let cameras = CameraPositions { positions, near: capture.near(facts, &placement) };
         let Floaters { keep, contradicted, unseen } =
-            floaters::find(&gaussians, &capture.targets()?, &cameras, measured)?;
+            floaters::find(&gaussians, &capture.targets()?, &cameras, measured, observe)?;
         let kept = retained("floaters", gaussians.into_owned(), &keep)?;
-        let after = psnr(&kept)?;
         self.content.set(kept);
-        let scores = before.zip(after).map(|(before, after)| {
-            format!("; held-out PSNR {before:.3} dB before, {after:.3} dB after")
-        });
-        let scores = scores.unwrap_or_default();
-        Ok(format!("floaters: {contradicted} contradicted, {unseen} unseen{scores}"))
+        Ok(format!("floaters: {contradicted} contradicted, {unseen} unseen"))
     }
 
     /// Keeps the Gaussians with the largest rendered weight over the training views; of equal ones the first.
@@ -235,10 +280,8 @@ impl Editor {
         self.open_capture()?;
         let Some(capture) = &self.capture else { return Ok(name) };
         let gaussians = self.content.whole()?;
-        let mut sums = vec![0.0; gaussians.count];
-        Measured::new(capture, self.placement, &gaussians, &self.facts).weights(|weights| {
-            sums.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight);
-        })?;
+        let sums =
+            Measured::new(capture, self.placement, &gaussians, &self.facts).summed_weights()?;
         let mut order: Vec<usize> = (0..sums.len()).collect();
         order.sort_by(|&a, &b| sums[b].total_cmp(&sums[a]));
         let mut keep = vec![false; sums.len()];
@@ -256,28 +299,38 @@ impl Editor {
     }
 
     fn crop(&mut self, region: &Region) -> Result<(String, Operation)> {
-        let region = match region {
-            Region::Cameras => {
-                let cameras = self.open_capture()?.cameras();
-                let (center, radius) = enclosing_sphere(&cameras);
-                if radius == 0.0 {
-                    let problem =
-                        "crop cameras: all cameras stand in one place; give a box or a sphere";
-                    return Err(Error::Usage(problem.to_owned()));
-                }
-                Region::Sphere(self.placement.point(center), radius * self.placement.scale)
-            }
-            region => *region,
-        };
         let name = match region {
-            Region::Box(low, high) => format!("crop to the box from {low:.3} to {high:.3}"),
+            Region::Box(low, high) => format!("crop to the box from {low:.4} to {high:.4}"),
             Region::Sphere(center, radius) => {
-                format!("crop to the sphere at {center:.3} of radius {radius:.3}")
+                format!("crop to the sphere at {center:.4} of radius {radius:.4}")
             }
-            Region::Cameras => "crop".to_owned(),
+            Region::Cameras => return self.crop_to_cameras(),
         };
-        self.step(&name, Step::Crop(region))?;
-        Ok((name, Operation::Crop(region)))
+        self.step(&name, Step::Crop(*region))?;
+        Ok((name, Operation::Crop(*region)))
+    }
+
+    /// Removes what is outside the sphere of the cameras and shown by no training view.
+    fn crop_to_cameras(&mut self) -> Result<(String, Operation)> {
+        let (center, radius) = enclosing_sphere(&self.open_capture()?.cameras());
+        if radius == 0.0 {
+            let problem = "crop cameras: all cameras stand in one place; give a box or a sphere";
+            return Err(Error::Usage(problem.to_owned()));
+        }
+        let placement = self.placement;
+        let (center, radius) = (placement.point(center), radius * placement.scale);
+        let name =
+            format!("crop to the sphere at {center:.4} of radius {radius:.4}, and what views show");
+        let Some(capture) = &self.capture else { return Ok((name, Operation::Delete(vec![]))) };
+        let gaussians = self.content.whole()?;
+        let shown = Measured::new(capture, placement, &gaussians, &self.facts).summed_weights()?;
+        let inside = Region::Sphere(center, radius);
+        let keep = (0..gaussians.count)
+            .map(|index| inside.contains(gaussians.position(index)) || shown[index] >= SHOWN);
+        let keep: Vec<bool> = keep.collect();
+        let kept = retained(&name, gaussians.into_owned(), &keep)?;
+        self.content.set(kept);
+        Ok((name, Operation::Delete(Span::of_false(&keep))))
     }
 
     /// The up direction of the photographs, in the edited world.
@@ -341,6 +394,9 @@ impl Editor {
             return refused(problem.to_owned());
         }
         self.facts.law = self.facts.law.filter(|law| facts.law == Some(*law));
+        if facts.targets.is_some() && facts.targets != self.facts.targets {
+            self.facts.targets = None;
+        }
         let mut merged = self.content.whole()?.into_owned();
         if other.shape.features != merged.shape.features {
             tracing::warn!("{}: has other features; those of both are dropped", file.display());

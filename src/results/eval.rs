@@ -1,16 +1,17 @@
 //! Scores a model on the test views of its dataset: against their reference images or, without any, against their
 //! targets.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use nightsplat_core::camera::{Camera, TrainingFrame};
-use nightsplat_core::output::own_file;
+use nightsplat_core::output::{create_folder, own_file};
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
 use nightsplat_photographs::metrics::{self, Scores, psnr_of_counted};
 use nightsplat_photographs::scene_tone::SceneTone;
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
 
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
@@ -45,6 +46,8 @@ pub enum ReferenceKind {
     References,
     /// The photographs of the test views, tone-mapped with the run's curve.
     PseudoGt,
+    /// Targets of the test views that another program made.
+    ExternalTargets,
     /// The photographs of the test views: without a curve, they are the targets.
     Photographs,
     /// The views in the light of the lamp at the camera, of a dataset that has them.
@@ -60,6 +63,10 @@ impl ReferenceKind {
                 "against their own pseudo-GT, as there are no reference images: how well the model reproduces its \
                  targets, not how right these are; runs of different curves do not compare",
             ),
+            Self::ExternalTargets => Some(
+                "against the targets of another program, as there are no reference images: how well the model \
+                 reproduces them, not how right these are; they compare with no other targets",
+            ),
             Self::Photographs => Some(
                 "against the photographs themselves, as there are no reference images and no curve",
             ),
@@ -72,6 +79,7 @@ impl ReferenceKind {
         match self {
             Self::References => "reference images",
             Self::PseudoGt => "pseudo-GT",
+            Self::ExternalTargets => "targets of another program",
             Self::Photographs => "photographs",
             Self::LitByLamp => "images in the light of the lamp",
         }
@@ -117,6 +125,8 @@ impl ScoreReference {
         let has_photographs = dataset.test_views().any(View::has_photograph);
         if has_references || !has_photographs {
             ReferenceKind::References
+        } else if tone.targets().is_some() {
+            ReferenceKind::ExternalTargets
         } else if tone.curve == ToneCurve::None {
             ReferenceKind::Photographs
         } else {
@@ -137,6 +147,36 @@ impl ScoreReference {
             _ => View::has_photograph,
         };
         dataset.test_views().filter(|view| has_target(view)).count()
+    }
+
+    /// Refuses to score a bright model against dark photographs for want of anything else.
+    ///
+    /// # Errors
+    /// [`Error::Input`] naming `path` if the photographs are what it is scored against, and its render of the first is
+    /// much brighter.
+    pub(crate) fn check_brightness(
+        &self,
+        path: &Path,
+        dataset: &Dataset,
+        mut render: impl FnMut(&View) -> Result<Rendered>,
+    ) -> Result<()> {
+        /// Of the render relative to the photograph.
+        const BRIGHT: f64 = 1.5;
+        let first = dataset.test_views().find(|view| view.has_photograph());
+        let Some(view) = first.filter(|_| self.against == ReferenceKind::Photographs) else {
+            return Ok(());
+        };
+        let Some(photograph) = view.loaded()? else { return Ok(()) };
+        let mean = |image: &Image| f64::from(Statistics::new(&image.data).mean_luminance);
+        let times = mean(render(view)?.output()) / mean(&photograph).max(f64::MIN_POSITIVE);
+        if times < BRIGHT {
+            return Ok(());
+        }
+        let problem = format!(
+            "is {times:.1} times as bright as the photographs and does not state their tone curve: a score against \
+             them favours dark corners; pass its run, or --photographs to score it against them all the same"
+        );
+        Err(Error::input(path, problem))
     }
 
     /// The image that a view is scored against, in 8 bits.
@@ -172,9 +212,19 @@ pub struct ScoredImages<'a> {
 impl ScoredImages<'_> {
     /// LPIPS of the unmasked pixels.
     pub fn lpips(&self, gpu: &Gpu, lpips: &Lpips) -> Result<f64> {
+        lpips.distance(gpu, &self.counted(), &self.target)
+    }
+
+    /// SSIM of the unmasked pixels, with a uniform window.
+    fn ssim_uniform(&self) -> Result<f64> {
+        metrics::ssim_uniform(&self.counted(), &self.target)
+    }
+
+    /// The render with the target at masked pixels.
+    fn counted(&self) -> Cow<'_, Image> {
         let Self { view, render, target, .. } = self;
         let mask = view.mask.as_ref().map(|mask| mask.resized(render.width, render.height));
-        lpips.distance(gpu, &metrics::counted(render, target, mask.as_deref()), target)
+        metrics::counted(render, target, mask.as_deref())
     }
 
     /// The scores of the render by some stops of linear light brighter.
@@ -208,8 +258,7 @@ impl ScoredImages<'_> {
         };
         for (name, image) in [("renders", &self.render), (targets, &self.target)] {
             let folder = own_file(own_file(folder.to_owned())?.join(name))?;
-            std::fs::create_dir_all(&folder)
-                .map_err(|error| Error::output(&folder, format!("cannot be created ({error})")))?;
+            create_folder(&folder)?;
             let path = own_file(folder.join(format!("{}.png", self.view.name)))?;
             self.view.upright(image.clone()).save_png8(path)?;
         }
@@ -311,6 +360,8 @@ impl ModelRenderer {
 pub(crate) struct Extras<'a> {
     /// LPIPS of the renders, and the device of its network.
     pub(crate) lpips: Option<(&'a Lpips, &'a Gpu)>,
+    /// SSIM with a uniform window.
+    pub(crate) uniform_ssim: bool,
     /// The renders after the least-squares gain and bias of each channel.
     pub(crate) with_gain_and_bias: bool,
     /// The exposures of views by name: stops relative to the mean of the training views.
@@ -373,6 +424,9 @@ impl Evaluation {
             self.add(name, &images.exposed(*stops)?, against, After::OwnExposure);
         }
         let mut values = vec![];
+        if extras.uniform_ssim {
+            values.push((Metric::SsimUniform, images.ssim_uniform()?));
+        }
         if let Some((lpips, gpu)) = extras.lpips {
             values.push((Metric::Lpips, images.lpips(gpu, lpips)?));
         }

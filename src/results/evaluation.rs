@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::csv;
-use nightsplat_photographs::dataset::View;
+use nightsplat_photographs::dataset::{View, ViewPictures};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::metrics::Scores;
 use nightsplat_photographs::scene_tone::SceneTone;
@@ -14,10 +14,10 @@ use super::eval::{
 };
 use super::finished_run::{FinishedRun, Opener, is_model};
 use super::report::{Chart, Comparison, Picture, Report, Series};
-use super::run;
+use super::{run, verdict};
 use crate::Result;
 use crate::networks::lpips::{Lpips, Range};
-use crate::train::{TrainConfig, known_stops};
+use crate::train::{Rendered, TrainConfig, known_stops};
 
 /// Maximum width of an image, pixels.
 const PICTURE_WIDTH: u32 = 480;
@@ -35,9 +35,13 @@ pub(crate) struct EvalOptions<'a> {
     pub(crate) dataset: Option<&'a Path>,
     pub(crate) reference: Option<&'a Path>,
     pub(crate) downscale: Option<f64>,
+    /// Renders of another program that are scored in place of those of the model.
+    pub(crate) renders: Option<&'a Path>,
     pub(crate) opener: Opener,
     /// The weights and the input range of LPIPS.
     pub(crate) lpips: Option<(&'a Path, Range)>,
+    /// Whether SSIM with a uniform window is added.
+    pub(crate) uniform_ssim: bool,
     /// Whether scores after gain and bias are added.
     pub(crate) align: bool,
     /// Whether scores of the renders as photographs are added.
@@ -52,8 +56,10 @@ pub(crate) struct EvalOptions<'a> {
 #[derive(Debug)]
 pub(crate) struct RunEvaluation {
     run: PathBuf,
+    /// The renders of another program, if these are scored.
+    renders: Option<PathBuf>,
     config: TrainConfig,
-    gaussians: usize,
+    gaussians: Option<usize>,
     pub(crate) evaluation: Evaluation,
     /// Images of the views with the lowest PSNR, the lowest first.
     worst: Vec<(f64, Comparison)>,
@@ -70,25 +76,36 @@ impl RunEvaluation {
             config.reference = options.reference.map(Path::to_owned).or(config.reference.take());
             config.downscale = options.downscale.unwrap_or(config.downscale);
         };
-        let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, lamp } =
-            FinishedRun::open_with(run, options.dataset, &options.opener, change)?;
+        let opened = FinishedRun::open_with(run, options.dataset, &options.opener, change)?;
+        let states_targets = opened.states_targets;
+        let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, lamp, .. } =
+            opened;
         model_renderer.set_lamp(lamp)?;
         let lpips = options.lpips.map(|(weights, range)| Lpips::load(&gpu, weights, range));
         let lpips = lpips.transpose()?;
         let scene = options.photographs.then(|| SceneTone::measure(&config.tone, &dataset));
         let extras = Extras {
             lpips: lpips.as_ref().map(|lpips| (lpips, &gpu)),
+            uniform_ssim: options.uniform_ssim,
             with_gain_and_bias: options.align || config.exposure.learn,
             scene: scene.transpose()?,
             stops: known_stops(&dataset, &config)?,
         };
         let mut reference = ScoreReference::new(&gpu, &config.tone, &dataset)?;
+        if !states_targets && !options.photographs {
+            reference.check_brightness(run, &dataset, |view| model_renderer.render(view))?;
+        }
         let (count, mut index) = (reference.view_count(&dataset), 0);
         let is_even = reference.is_evenly_lit(&dataset);
+        let pictures = options.renders.map(|folder| ViewPictures::of_tests(folder, &dataset));
+        let pictures = pictures.transpose()?;
         let render = |view: &View| {
             begin(index, count, &view.name);
             index += 1;
-            model_renderer.render_as(view, is_even)
+            match &pictures {
+                Some(pictures) => pictures.load(view).map(Rendered::from),
+                None => model_renderer.render_as(view, is_even),
+            }
         };
         let mut worst = vec![];
         let keep = |images: &ScoredImages<'_>| {
@@ -101,22 +118,33 @@ impl RunEvaluation {
             Ok(())
         };
         let mut evaluation = Evaluation::new(&mut reference, &dataset, &extras, render, keep)?;
-        if lamp.is_some() {
+        if lamp.is_some() && pictures.is_none() {
             evaluation.add_lit(&dataset, |view| model_renderer.render(view))?;
         }
-        let render = |view: &View| model_renderer.render(view);
-        eval::warn_of_holes(&evaluation, &dataset, config.background, render)?;
+        if pictures.is_none() {
+            let render = |view: &View| model_renderer.render(view);
+            eval::warn_of_holes(&evaluation, &dataset, config.background, render)?;
+        }
         if evaluation.scores.is_empty() {
             let root = dataset.root.display();
             tracing::warn!(
                 "{root}: no test view has a reference image or a photograph: nothing to score"
             );
         }
-        Ok(Self { run: run.to_owned(), config, gaussians: gaussian_count, evaluation, worst })
+        let renders = options.renders.map(Path::to_owned);
+        let gaussians = Some(gaussian_count).filter(|_| renders.is_none());
+        Ok(Self { run: run.to_owned(), renders, config, gaussians, evaluation, worst })
     }
 
     /// The scores with what `metrics.json` of the run records besides.
     pub(crate) fn json(&self) -> Value {
+        if let Some(renders) = &self.renders {
+            let mut metrics = self.evaluation.json(None, None, None);
+            metrics["renders"] = serde_json::json!(renders);
+            eval::add_reference(&mut metrics, &self.config.tone);
+            self.evaluation.add_other_steps(&mut metrics, false);
+            return metrics;
+        }
         let recorded = run::load_metrics(&self.run);
         let steps = recorded["steps"].as_u64().or_else(|| run::stopped_at(&self.run));
         let steps = steps.or(Some(self.config.steps)).filter(|_| !is_model(&self.run));
@@ -163,18 +191,20 @@ impl RunEvaluation {
         if let [worst, _, ..] = &mut comparisons[..] {
             worst.title = format!("The worst view, {}", worst.title);
         }
-        let mean = |metric| evaluation.mean(metric, After::Model);
-        let mean = mean(Metric::Psnr).zip(mean(Metric::Ssim)).map(|(psnr, ssim)| {
-            let views = evaluation.views().len();
-            format!("Mean over {views} test views: {psnr:.2} dB, SSIM {ssim:.3}.")
-        });
+        let verdict = verdict::of_model(evaluation).map(|sentence| sentence + ".");
+        let lpips = evaluation.lpips.zip(evaluation.mean(Metric::Lpips, After::Model));
+        let lpips = lpips.map(|(measure, mean)| format!("{}: {mean:.4}.", measure.title()));
         let shown = format!("Images of {} views, the worst first.", comparisons.len());
         let against = evaluation.label().map(|label| format!("Scores are {label}."));
+        let (subject, charts) = match &self.renders {
+            Some(renders) => (renders, vec![]),
+            None => (&self.run, history(&self.run)),
+        };
         Report {
-            title: format!("Evaluation of {}", self.run.display()),
-            intro: mean.into_iter().chain(against).chain([shown]).collect(),
+            title: format!("Evaluation of {}", subject.display()),
+            intro: verdict.into_iter().chain(lpips).chain(against).chain([shown]).collect(),
             tables: vec![evaluation.table()],
-            charts: history(&self.run),
+            charts,
             comparisons,
             ..Report::default()
         }

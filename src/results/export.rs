@@ -1,4 +1,4 @@
-//! Exports of a model: SPZ, glTF, SOG, streamed SOG, and a page with its own viewer.
+//! Exports of a model: SPZ, glTF, USD, SOG, streamed SOG, and a page with its own viewer.
 //!
 //! Each exports the Gaussians as they are in `model.ply`: in the colours that viewers expect and with `OpenCV`'s axes,
 //! y down and z forward. The model is as bright as its targets; a dark one would show banding, as SPZ quantises colours
@@ -10,6 +10,7 @@ mod palette;
 pub mod sog;
 pub mod spz;
 pub mod streamed;
+pub mod usd;
 
 use std::io::Write as _;
 use std::path::Path;
@@ -32,6 +33,10 @@ pub enum Format {
     Spz(spz::Version),
     /// glTF with `KHR_gaussian_splatting`.
     Glb,
+    /// `OpenUSD` with `ParticleField3DGaussianSplat`, as text.
+    Usda,
+    /// The same in a package.
+    Usdz,
     /// A fifteenth of the size; `PlayCanvas`.
     Sog,
     /// A folder of SOG in chunks at several levels of detail, which viewers of `PlayCanvas` load as needed.
@@ -42,10 +47,12 @@ pub enum Format {
 
 impl Format {
     /// Every format.
-    pub(crate) const ALL: [Self; 6] = [
+    pub(crate) const ALL: [Self; 8] = [
         Self::Ply,
         Self::Spz(spz::Version::V4),
         Self::Glb,
+        Self::Usda,
+        Self::Usdz,
         Self::Sog,
         Self::StreamedSog,
         Self::Html,
@@ -57,13 +64,15 @@ impl Format {
             Self::Ply => "ply",
             Self::Spz(_) => "spz",
             Self::Glb => "glb",
+            Self::Usda => "usda",
+            Self::Usdz => "usdz",
             Self::Sog => "sog",
             Self::StreamedSog => "streamed-sog",
             Self::Html => "html",
         }
     }
 
-    /// The format that a file's extension names: `ply`, `spz`, `glb` or `sog`.
+    /// The format that a file's extension names: `ply`, `spz`, `glb`, `usda`, `usdz` or `sog`.
     ///
     /// # Errors
     /// [`Error::Usage`] for any other extension.
@@ -72,7 +81,8 @@ impl Format {
         let is_file = |format: &Self| !matches!(format, Self::StreamedSog | Self::Html);
         let mut files = Self::ALL.into_iter().filter(is_file);
         files.find(|format| format.name() == extension).ok_or_else(|| {
-            let problem = "has no extension of a model file; name it .ply, .spz, .glb or .sog";
+            let problem =
+                "has no extension of a model file; name it .ply, .spz, .glb, .usda, .usdz or .sog";
             Error::Usage(format!("{} {problem}", path.display()))
         })
     }
@@ -100,6 +110,8 @@ impl Format {
             }
             Self::Spz(version) => spz::encode(gaussians, provenance, version)?,
             Self::Glb => glb::encode(gaussians, provenance)?,
+            Self::Usda => usd::encode(gaussians, provenance)?,
+            Self::Usdz => usd::pack(gaussians, provenance)?,
             Self::Sog => sog::encode(gaussians, provenance)?,
         };
         write_whole(path, &bytes)
@@ -118,8 +130,8 @@ impl FromStr for Format {
 }
 
 impl Model {
-    /// Writes the model in the format that the file's extension names: `.ply`, `.spz`, `.glb` or `.sog`. The file
-    /// states the near plane, the alpha limit, the colours and the origin.
+    /// Writes the model in the format that the file's extension names: `.ply`, `.spz`, `.glb`, `.usda`, `.usdz` or
+    /// `.sog`. The file states the near plane, the alpha limit, the colours and the origin.
     ///
     /// # Errors
     /// As [`Gaussians::save`].
@@ -139,7 +151,7 @@ impl Model {
 }
 
 impl Gaussians {
-    /// Writes the Gaussians in the format that the file's extension names: `.ply`, `.spz`, `.glb` or `.sog`.
+    /// Writes the Gaussians in the format that the file's extension names, as [`Format::from_path`] does.
     ///
     /// # Errors
     /// The extension names none, the model does not fit the format, or the file cannot be written; no partial file is
@@ -213,7 +225,7 @@ impl Provenance {
 
     /// The facts for a file of `gaussians`, with their origin.
     fn facts_of(&self, gaussians: &Gaussians) -> ModelFacts {
-        ModelFacts { origin: gaussians.origin, ..self.facts }
+        ModelFacts { origin: gaussians.origin, ..self.facts.clone() }
     }
 
     /// A header line that maps the file's positions to the dataset's world, if they differ. `half_turned`: the file's
@@ -318,9 +330,13 @@ pub(crate) mod tests {
     #[test]
     fn a_model_is_saved_in_the_format_of_its_extension() {
         let (model, folder) = (drawn(4, 1), tempfile::tempdir().unwrap());
-        for (name, magic) in
-            [("a.ply", "ply"), ("a.spz", "NGSP"), ("a.glb", "glTF"), ("A.SOG", "PK")]
-        {
+        for (name, magic) in [
+            ("a.ply", "ply"),
+            ("a.spz", "NGSP"),
+            ("a.glb", "glTF"),
+            ("a.usda", "#usda 1.0"),
+            ("A.SOG", "PK"),
+        ] {
             let path = folder.path().join(name);
             model.save(&path).unwrap();
             assert!(std::fs::read(&path).unwrap().starts_with(magic.as_bytes()), "{name}");

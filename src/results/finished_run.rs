@@ -42,6 +42,8 @@ pub(crate) struct FinishedRun {
     pub(crate) model_renderer: ModelRenderer,
     /// The lamp that lit the photographs, in units of the dataset's world; renders are evenly lit.
     pub(crate) lamp: Option<Lamp>,
+    /// Whether the targets are known: those of a run, or of a file that states them.
+    pub(crate) states_targets: bool,
 }
 
 impl FinishedRun {
@@ -99,14 +101,20 @@ impl FinishedRun {
                 run::load_networks(&gpu, folder, &config.model, model.gaussians.shape.features)?,
             )?,
             lamp,
+            states_targets: true,
             config,
             gpu,
         })
     }
 
-    /// [`Self::open`] with renders in the light of the photographs, for scores.
-    pub(crate) fn open_lit(folder: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
-        let mut run = Self::open(folder, dataset, opener)?;
+    /// [`Self::open_with`] with renders in the light of the photographs, for scores.
+    pub(crate) fn open_lit(
+        folder: &Path,
+        dataset: Option<&Path>,
+        opener: &Opener,
+        change: impl FnOnce(&mut TrainConfig),
+    ) -> Result<Self> {
+        let mut run = Self::open_with(folder, dataset, opener, change)?;
         run.model_renderer.set_lamp(run.lamp)?;
         Ok(run)
     }
@@ -118,9 +126,10 @@ impl FinishedRun {
         opener: &Opener,
         change: impl FnOnce(&mut TrainConfig),
     ) -> Result<Self> {
-        let dataset = dataset.ok_or_else(|| needs_photographs(path))?;
         let (gaussians, facts) = models::read(path)?;
-        let mut config = config_of_file(&gaussians, &facts, Some(dataset));
+        let dataset = dataset.ok_or_else(|| needs_photographs(path))?;
+        let states_targets = facts.targets.is_some();
+        let mut config = config_of_file(path, &gaussians, &facts, Some(dataset))?;
         change(&mut config);
         let gpu = (opener.open)(opener.device.as_ref().unwrap_or(&DeviceChoice::Best))?;
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
@@ -131,7 +140,15 @@ impl FinishedRun {
         let model = Model::of_shown(gaussians, &ModelFacts { near, ..facts });
         let model_renderer = ModelRenderer::new(&gpu, &model, &config, None)?;
         let gaussian_count = model.gaussians.count;
-        Ok(Self { gpu, config, dataset, gaussian_count, model_renderer, lamp: None })
+        Ok(Self {
+            gpu,
+            config,
+            dataset,
+            gaussian_count,
+            model_renderer,
+            lamp: None,
+            states_targets,
+        })
     }
 }
 
@@ -146,20 +163,27 @@ pub(crate) fn is_model(path: &Path) -> bool {
     path.is_file() || (!path.is_dir() && path.extension().is_some_and(is_named))
 }
 
-/// The settings to render a model file with: the defaults, except for those that it states.
+/// The settings to render and to score a model file with: the defaults, except for those that it states.
+///
+/// # Errors
+/// It states settings that this version does not know.
 pub(crate) fn config_of_file(
+    path: &Path,
     gaussians: &Gaussians,
     facts: &ModelFacts,
     dataset: Option<&Path>,
-) -> TrainConfig {
+) -> Result<TrainConfig> {
     let mut config = TrainConfig {
         dataset: dataset.unwrap_or(Path::new("")).to_owned(),
         sh_degree: gaussians.shape.sh_degree,
-        // Without reference images, renders are compared with the photographs.
+        // Of a file that states none, renders are compared with the photographs.
         tone: ToneSettings::new(ToneCurve::None),
         ..TrainConfig::default()
     };
     config.model.raw_colors = facts.raw_colors.unwrap_or(config.model.raw_colors);
     config.antialiasing.compensation = facts.antialiased;
-    config
+    let Some(stated) = &facts.targets else { return Ok(config) };
+    config.with_targets(stated).map_err(|problem| {
+        Error::input(path, format!("states targets that this version does not make: {problem}"))
+    })
 }

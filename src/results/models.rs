@@ -40,9 +40,20 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, ModelFacts)> {
         let file = PartFile::open(&path.join("model.ply"), 1)?;
         return Ok((gaussians, facts_of_run(&config, file.as_ref())));
     }
-    // A PLY without an end of its header may be long.
-    PartFile::open(path, 1)?;
-    let bytes = input::bytes(path)?;
+    let (facts, mut gaussians) = match PartFile::open(path, 1)? {
+        Some(file) => (file.facts().clone(), file.whole()?),
+        None => read_whole(path)?,
+    };
+    let count = gaussians.count;
+    gaussians.retain_finite();
+    warn_of_left_out(path, count, gaussians.count)?;
+    warn_of(path, &facts);
+    Ok((gaussians, facts))
+}
+
+/// A model in a format that is read whole.
+fn read_whole(path: &Path) -> Result<(ModelFacts, Gaussians)> {
+    let bytes = input::bytes_if(path, |start| FileKind::from_bytes(start).is_some())?;
     let parsed = match FileKind::from_bytes(&bytes) {
         Some(FileKind::Ply) => ply::parse_any(&bytes),
         Some(FileKind::Spz) => spz::decode(&bytes),
@@ -50,14 +61,16 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, ModelFacts)> {
         None if path.extension().is_some_and(|ending| ending == "splat" || ending == "ksplat") => {
             Err(format!("is neither PLY, SPZ nor SOG; {CONVERTER}"))
         }
-        None => Err("is not a model: neither PLY, SPZ nor SOG".to_owned()),
+        None if path.extension().is_some_and(|ending| ending == "html") => {
+            let problem = "is a page, not a model; pass the run or the model that it was made of";
+            Err(problem.to_owned())
+        }
+        None => {
+            Err("is not a model: neither PLY, SPZ nor SOG; name one, or a run directory".to_owned())
+        }
     };
-    let (mut gaussians, facts) = parsed.map_err(|problem| Error::input(path, problem))?;
-    let count = gaussians.count;
-    gaussians.retain_finite();
-    warn_of_left_out(path, count, gaussians.count)?;
-    warn_of(path, &facts);
-    Ok((gaussians, facts))
+    let (gaussians, facts) = parsed.map_err(|problem| ply::unusable(path, &problem))?;
+    Ok((facts, gaussians))
 }
 
 /// Opens a PLY for reading part by part; `None` for other formats.
@@ -70,7 +83,7 @@ pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, M
     }
     let file = PartFile::open(path, part)?;
     Ok(file.map(|file| {
-        let facts = *file.facts();
+        let facts = file.facts().clone();
         warn_of(path, &facts);
         (file, facts)
     }))

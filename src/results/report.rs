@@ -7,6 +7,7 @@ use nightsplat_photographs::image::Image;
 pub use self::chart::{Chart, Mark, Series, VerticalLine};
 pub(crate) use self::data_uri::{base64, jpeg, jpeg_of_quality};
 pub use self::distribution::{Distribution, distributions};
+pub use self::sheet::ContactSheet;
 pub use self::table::{Best, Column, NumberTable};
 
 mod axis;
@@ -14,6 +15,7 @@ mod chart;
 mod data_uri;
 mod distribution;
 mod labels;
+mod sheet;
 mod table;
 
 /// A page. All text is escaped.
@@ -21,10 +23,14 @@ mod table;
 pub struct Report {
     /// The heading, also the window's title.
     pub title: String,
+    /// A page to look into, first of all: address and text.
+    pub window: Option<[String; 2]>,
     /// The paragraphs under the heading.
     pub intro: Vec<String>,
     /// Links under the introduction: address and text.
     pub links: Vec<[String; 2]>,
+    /// Contact sheets, in order.
+    pub sheets: Vec<ContactSheet>,
     /// Rows of images, in order.
     pub comparisons: Vec<Comparison>,
     /// Tables of text, in order.
@@ -75,10 +81,12 @@ impl Picture {
 }
 
 impl Report {
-    /// The page as HTML: text, images, tables, charts.
+    /// The page as HTML: the first table of text, images, the other tables, charts.
     pub fn html(&self) -> String {
-        let facts: String = self.facts.iter().map(TextTable::html).collect();
-        self.page(&(facts + &self.pictures_html() + &self.tables_html() + &self.charts_html()))
+        let mut facts = self.facts.iter().map(TextTable::html);
+        let first = facts.next().unwrap_or_default() + &self.pictures_html();
+        let others = facts.collect::<String>() + &self.tables_html() + &self.charts_html();
+        self.page(&(first + &others))
     }
 
     /// The page as HTML with the charts first and the tables last.
@@ -90,18 +98,19 @@ impl Report {
         self.tables.iter().map(NumberTable::html).collect()
     }
 
-    fn charts_html(&self) -> String {
+    pub(crate) fn charts_html(&self) -> String {
         let figure = |chart: &Chart| format!("<figure class=\"plot\">{}</figure>\n", chart.svg());
         let plots: String = self.charts.iter().map(figure).collect();
         if plots.is_empty() { plots } else { format!("<div class=\"plots\">\n{plots}</div>\n") }
     }
 
     fn pictures_html(&self) -> String {
-        self.comparisons.iter().map(Comparison::html).collect()
+        let sheets = self.sheets.iter().map(ContactSheet::html);
+        sheets.chain(self.comparisons.iter().map(Comparison::html)).collect()
     }
 
     /// The page around its body.
-    fn page(&self, body: &str) -> String {
+    pub(crate) fn page(&self, body: &str) -> String {
         let title = escape(&self.title);
         let mut html = format!(
             "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
@@ -110,6 +119,11 @@ impl Report {
             include_str!("report/style.css")
         );
         // Writing to a string cannot fail, so the results below are ignored.
+        if let Some([address, text]) = &self.window {
+            let (address, text) = (escape(address), escape(text));
+            let frame = format!("<iframe src=\"{address}\" title=\"{text}\"></iframe>");
+            let _ = writeln!(html, "{frame}\n<p><a href=\"{address}\">{text}</a></p>");
+        }
         for paragraph in &self.intro {
             let _ = writeln!(html, "<p>{}</p>", escape(paragraph));
         }

@@ -15,7 +15,7 @@ mod tail;
 mod tensorboard;
 mod train;
 
-pub use directory::{Progress, RunDirectory, load_progress};
+pub use directory::{RunDirectory, RunProgress, load_progress};
 pub use done::{done_steps, done_steps_by_stamp};
 pub use events::{Event, RunSummary};
 pub(crate) use files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE, TRAINED_WITH};

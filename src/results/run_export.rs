@@ -192,11 +192,11 @@ impl ExportOptions<'_> {
             let (gaussians, facts) = models::read(source)?;
             return Ok((gaussians, facts, config));
         }
+        let (gaussians, facts) = models::read(source)?;
         if self.format == Format::Html && self.dataset.is_none() {
             return Err(needs_photographs(source));
         }
-        let (gaussians, facts) = models::read(source)?;
-        let config = config_of_file(&gaussians, &facts, self.dataset);
+        let config = config_of_file(source, &gaussians, &facts, self.dataset)?;
         Ok((gaussians, facts, config))
     }
 
@@ -219,7 +219,7 @@ impl ExportOptions<'_> {
                  at least what is written"
             );
         }
-        Ok((linear, ModelFacts { linear: Some(stops as f32), law: None, ..facts }))
+        Ok((linear, ModelFacts { linear: Some(stops as f32), law: None, targets: None, ..facts }))
     }
 
     /// The settings with the dataset where it is now.

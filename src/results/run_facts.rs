@@ -53,6 +53,7 @@ impl RunFacts {
                 "as requested: the photographs are the targets"
             }
             Tone::Auto => "brightness chosen from the photographs",
+            Tone::External(_) => "as requested: no curve and no tone law",
             Tone::Formula(ToneCurve::None) => "",
             _ => "as requested",
         };
@@ -73,7 +74,7 @@ impl RunFacts {
             notes: notes(config, dataset),
             split: Dataset::split_rule(&config.dataset, &config.load_options(), of(Split::Test)),
             points: dataset.points.len(),
-            curve: config.tone.curve.name().to_owned(),
+            curve: config.tone.curve.to_string(),
             why: match planned {
                 Some(planned) if why.is_empty() => planned,
                 _ => why.to_owned(),

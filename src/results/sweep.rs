@@ -13,8 +13,8 @@ mod table;
 pub use costs::FILES as COST_FILES;
 pub use leaderboard::{FILES as LEADERBOARD_FILES, Leaderboard};
 pub use point::{
-    ADAPTIVE, ALL_PARTS, OFFSET, PARTS, PLAIN, PRESET, SEED, SweepAxis, SweepPoint, all_curves,
-    setting_of,
+    ADAPTIVE, ALL_PARTS, OFFSET, PARTS, PLAIN, PRESET, RENDERS, SEED, SweepAxis, SweepPoint,
+    all_curves, setting_of,
 };
 pub use rows::SweepResults;
 pub use run::{FailedPoint, LPIPS_FILE, SweepRun, measured_later};

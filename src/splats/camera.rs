@@ -4,7 +4,7 @@ use glam::{DAffine3, DVec2};
 use nightsplat_core::camera::{CameraModel, Patch};
 
 use crate::kernels;
-use crate::kernels::camera::{CAMERA_FISHEYE, CAMERA_PINHOLE};
+use crate::kernels::camera::{CAMERA_FISHEYE, CAMERA_ORTHOGRAPHIC, CAMERA_PINHOLE};
 use crate::kernels::camera_pinhole::JACOBIAN_MARGIN;
 
 /// The patch as the kernels take it: a camera with a shifted principal point.
@@ -17,7 +17,7 @@ impl From<&Patch> for kernels::Camera {
         let whole = Patch::from(&patch.camera).size.as_vec2();
         let margin = JACOBIAN_MARGIN as f32 * whole;
         let (distortion, largest_angle) = match patch.camera.model {
-            CameraModel::Pinhole => ([0.0; 4], 0.0),
+            CameraModel::Pinhole | CameraModel::Orthographic => ([0.0; 4], 0.0),
             CameraModel::Fisheye(lens) => {
                 (lens.coefficients.map(|k| k as f32), lens.largest_angle() as f32)
             }
@@ -41,6 +41,7 @@ pub(crate) fn model_number(model: &CameraModel) -> u32 {
     match model {
         CameraModel::Pinhole => CAMERA_PINHOLE,
         CameraModel::Fisheye(_) => CAMERA_FISHEYE,
+        CameraModel::Orthographic => CAMERA_ORTHOGRAPHIC,
     }
 }
 

@@ -31,6 +31,9 @@ pub struct Model {
     /// The curve from its photographs to its colours, which [`Target::is_photograph`](crate::Target::is_photograph)
     /// inverts; `None`: not stated.
     pub law: Option<SceneLaw>,
+    /// The settings of its run that make its targets from photographs, as a file states them.
+    #[doc(hidden)]
+    pub targets: Option<String>,
 }
 
 /// Near plane, alpha limit and colours are those of a file that does not state them.
@@ -38,7 +41,7 @@ impl From<Gaussians> for Model {
     fn from(gaussians: Gaussians) -> Self {
         let RenderSettings { near, max_alpha, raw_colors, antialiased, .. } =
             RenderSettings::default();
-        Self { gaussians, near, max_alpha, raw_colors, antialiased, law: None }
+        Self { gaussians, near, max_alpha, raw_colors, antialiased, law: None, targets: None }
     }
 }
 
@@ -52,6 +55,7 @@ impl Model {
             raw_colors: facts.raw_colors.unwrap_or(defaults.raw_colors),
             antialiased: facts.antialiased,
             law: facts.law,
+            targets: facts.targets.clone(),
             ..defaults
         }
     }
@@ -76,7 +80,7 @@ impl Model {
     /// # Ok::<(), nightsplat::Error>(())
     /// ```
     pub fn render_settings(&self) -> RenderSettings {
-        let Self { gaussians, near, max_alpha, raw_colors, antialiased, law } = self;
+        let Self { gaussians, near, max_alpha, raw_colors, antialiased, law, .. } = self;
         RenderSettings {
             near: *near,
             max_alpha: *max_alpha,
@@ -122,7 +126,9 @@ impl Model {
         }
         let is_one = parts.iter().all(|(part, _)| part.law == first.law);
         let law = first.law.filter(|_| is_one);
-        Ok(Self { gaussians: joined, law, ..**first })
+        let Self { near, max_alpha, raw_colors, antialiased, .. } = **first;
+        let targets = None;
+        Ok(Self { gaussians: joined, near, max_alpha, raw_colors, antialiased, law, targets })
     }
 
     /// The Gaussians in the colours that viewers show, as files hold them.
@@ -143,6 +149,7 @@ impl Model {
             antialiased: self.antialiased,
             linear: None,
             law: self.law,
+            targets: self.targets.clone(),
             origin: self.gaussians.origin,
         }
     }

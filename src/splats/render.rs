@@ -24,6 +24,8 @@ mod images;
 mod instances;
 mod lamp;
 mod limits;
+mod motion;
+mod picks;
 mod pipelines;
 mod projection;
 mod settings;
@@ -52,9 +54,12 @@ use draw::HostTargets;
 pub(crate) use gradients::ViewGradients;
 pub use instances::Instance;
 pub(crate) use lamp::DeviceLamp;
+use motion::MotionVectors;
+use picks::Picks;
+pub use picks::{Hit, Pick};
 use pipelines::{ProjectionKind, Projections, WrittenGradients};
 pub use settings::{Purpose, RenderSettings};
-pub use target::{DepthConvention, DepthKind, SceneDepth, Target};
+pub use target::{DepthConvention, DepthKind, Motion, SceneDepth, Target};
 
 /// Parameters of one render.
 #[derive(Clone, Copy, Debug)]
@@ -111,6 +116,8 @@ pub struct Renderer {
     /// (H, W): the depths beyond which nothing is seen, where a draw has such.
     limits: Buffer<f32>,
     host_targets: Option<HostTargets>,
+    picks: Option<Picks>,
+    motion: Option<MotionVectors>,
     /// Lights the colours.
     lamp: Option<DeviceLamp>,
 }
@@ -303,8 +310,12 @@ impl Renderer {
         let (Some(blend_backward), Some(project_backward)) =
             (&self.blend_backward, project_backward)
         else {
-            let problem =
-                "a renderer with Purpose::Show has no gradients; make it with Purpose::Train";
+            let problem = match self.settings.purpose {
+                Purpose::Show => {
+                    "a renderer with Purpose::Show has no gradients; make it with Purpose::Train"
+                }
+                Purpose::Train => "an orthographic camera has no gradients; take another camera",
+            };
             return Err(Error::Usage(problem.to_owned()));
         };
         let color_floats = color_floats(self.settings.channels());

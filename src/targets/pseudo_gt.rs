@@ -55,10 +55,10 @@ impl PseudoGt {
     /// Builds the kernels for one curve.
     pub fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
         settings.check()?;
-        let numbers = match &settings.curve {
-            Tone::Profile(profile) => profile.rows(),
-            Tone::Table(table) => table.knots().iter().flat_map(|knot| knot.to_array()).collect(),
-            Tone::Formula(_) | Tone::Auto => vec![],
+        let numbers = match (&settings.curve, settings.table()) {
+            (Tone::Profile(profile), _) => profile.rows(),
+            (_, Some(table)) => table.knots().iter().flat_map(|knot| knot.to_array()).collect(),
+            (_, None) => vec![],
         };
         Ok(Self {
             gpu: gpu.clone(),

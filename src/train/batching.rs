@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use super::call::Call;
 use crate::Error;
 
 /// The most steps of a submission.
@@ -71,6 +72,7 @@ impl StepBatching {
 #[derive(Debug, Default)]
 pub(super) struct Submissions {
     pub(super) batching: StepBatching,
+    pub(super) call: Call,
     /// The error that ended the last call after finished steps.
     pub(super) failed: Option<Error>,
 }

@@ -15,7 +15,7 @@ use nightsplat_core::random::Stream;
 use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
 use nightsplat_photographs::dataset::{
-    DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize, PixelOrientation,
+    DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize, PixelOrientation, RowBands,
 };
 use nightsplat_photographs::image::StoredLight;
 use nightsplat_photographs::tone::ToneSettings;
@@ -124,6 +124,11 @@ pub struct TrainConfig {
     falloff: Option<f64> = None, "found from the points where corners are dark" => Rule::from_to(0.0, 1000.0);
     /// The part of the fall-off with the square of u.
     falloff_squared: f64 = 0.0 => Rule::from_to(-1000.0, 1000.0);
+    /// The bands of rows that lamps on mains leave under a rolling shutter: the number in the height of a photograph,
+    /// and by the name of its view the parts c and s of the light, which is divided by 1 + c cos + s sin; {}: left as
+    /// they are.
+    bands: Option<RowBands> = None, "found from the points where rows differ"
+        => Rule::Table("a table with count and waves");
     /// Undistort fisheye photographs to pinhole ones, cropped to 60 degrees off the axis, instead of training with the
     /// fisheye model; other distorted photographs are always undistorted.
     undistort: bool = false => Rule::Flag, "--undistort";
@@ -328,12 +333,14 @@ impl TrainConfig {
             images: self.images.clone(),
             orientation: self.orientation,
             reference: self.reference.clone(),
+            targets: self.tone.targets().map(Path::to_owned),
             invert_masks: self.invert_masks,
             mask_borders: self.mask_borders,
             light: self.light,
             mask_overlays: self.mask_overlays,
             white_balance: self.white_balance.clone(),
             falloff: self.falloff.map(|falloff| [falloff, self.falloff_squared]),
+            bands: self.bands.clone(),
             undistort: self.undistort,
             measured: match &self.tone {
                 ToneSettings { law: Some(_), .. } => MeasuredSize::None,
@@ -415,6 +422,7 @@ impl TrainConfig {
             max_alpha: Some(max_alpha),
             raw_colors: Some(raw_colors),
             antialiased,
+            targets: self.stated_targets(),
             ..ModelFacts::default()
         }
     }

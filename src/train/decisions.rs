@@ -60,6 +60,11 @@ pub(super) struct Decisions {
 }
 
 impl Decisions {
+    /// Whether anything is due before the next step.
+    pub(super) fn are_due(&self) -> bool {
+        self.score_due || self.density_due.is_some() || self.degree_due
+    }
+
     /// Whether growth ends at the last round because it gained less than `growth_gain` dB for each doubling of the
     /// Gaussians.
     pub(super) fn gains_too_little(&self, growth_gain: f64) -> bool {

@@ -17,11 +17,13 @@ mod remarks;
 mod sharpness;
 mod target_noise;
 
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use nightsplat_core::camera::Camera;
+use nightsplat_core::natural;
+use nightsplat_core::watch::Stage;
 use nightsplat_photographs::dataset::{self, Borders, Dataset, LoadOptions, Split, View};
 use nightsplat_photographs::findings::{brought_near_white, findings};
 use nightsplat_photographs::image::{
@@ -36,16 +38,22 @@ use serde::Serialize;
 use crate::{Error, Result};
 use geometry::SceneGeometry;
 pub(super) use geometry::exposures_at_points;
-pub use lamp::{LampDiagnosis, falloff::FalloffDiagnosis};
-use lamp::{LampObservations, bands};
+pub(crate) use geometry::median;
+pub use lamp::{LampDiagnosis, bands::BandsDiagnosis, falloff::FalloffDiagnosis};
+use lamp::{LampObservations, shading};
 pub use noise::ChannelNoise;
 use photograph::PhotographStatistics;
 pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
 pub(crate) use remarks::remarks_at_points;
 pub use target_noise::TargetNoise;
 
-/// A view is reported as blurred from this many times the median, and this many pixels more.
-const BLURRED: [f64; 2] = [1.6, 0.7];
+/// Whether edges of this width are blurred, given the median width of the photographs.
+pub(crate) fn is_blurred(blur: f64, median: f64) -> bool {
+    blur > 1.6 * median && blur > median + 0.7
+}
+
+/// From this many stops on, and this many standard deviations of all views, an exposure is odd.
+const ODD_EXPOSURE: [f64; 2] = [1.0, 2.5];
 
 /// The diagnosis of a training photograph. Luminance is of encoded values, light is linear.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -141,6 +149,8 @@ pub struct SceneDiagnosis {
     pub lamp_unknown: Option<String>,
     /// The fall-off of the lens, before it was corrected; `None` if the points do not show it.
     pub falloff: Option<FalloffDiagnosis>,
+    /// Bands of rows, before they were corrected; `None` if the points do not show them.
+    pub bands: Option<BandsDiagnosis>,
 }
 
 /// The diagnosis of a capture.
@@ -154,6 +164,8 @@ pub struct Diagnosis {
     pub pixels: u64,
     /// Remarks, a sentence each.
     pub remarks: Vec<String>,
+    /// What is odd about photographs, in a word or two, by name.
+    pub odd: BTreeMap<String, String>,
     /// The names of photographs without a pose.
     pub without_pose: Vec<String>,
     /// All training views together.
@@ -168,17 +180,27 @@ pub struct Diagnosis {
 
 impl Diagnosis {
     /// Loads a dataset and diagnoses its training photographs, as stored, while they are decoded. Where the corners of
-    /// a lens are dark, and `options` do not say its fall-off, the photographs are loaded again without it.
+    /// a lens are dark or rows differ, and `options` do not say by how much, the photographs are loaded again without
+    /// it.
     pub fn load(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
         let (dataset, diagnosis) = Self::load_with(root, options)?;
-        let found = diagnosis.scene.falloff.filter(FalloffDiagnosis::is_found);
-        let Some(found) = found.filter(|_| options.falloff.is_none()) else {
+        let SceneDiagnosis { falloff, bands, .. } = &diagnosis.scene;
+        let falloff = falloff.filter(|found| options.falloff.is_none() && found.is_found());
+        let bands = bands.clone().filter(|found| options.bands.is_none() && found.is_found());
+        if falloff.is_none() && bands.is_none() {
             return Ok((dataset, diagnosis));
-        };
+        }
         drop(dataset);
-        let options = LoadOptions { falloff: Some(found.falloff), ..options.clone() };
+        let mut options = options.clone();
+        options.falloff = options.falloff.or(falloff.map(|found| found.falloff));
+        options.bands = options.bands.or(bands.as_ref().map(|found| found.rows.clone()));
         let (dataset, mut diagnosis) = Self::load_with(root, &options)?;
-        diagnosis.scene.falloff = Some(FalloffDiagnosis { is_corrected: true, ..found });
+        if let Some(found) = falloff {
+            diagnosis.scene.falloff = Some(FalloffDiagnosis { is_corrected: true, ..found });
+        }
+        if let Some(found) = bands {
+            diagnosis.scene.bands = Some(BandsDiagnosis { is_corrected: true, ..found });
+        }
         Ok((dataset, diagnosis))
     }
 
@@ -236,15 +258,16 @@ impl Diagnosis {
         };
         let diagnosed: Vec<ViewDiagnosis> = photographs.iter().enumerate().map(of_view).collect();
         let without_pose = without_pose(&paths, &files, dataset)?;
-        let mut remarks = remarks(&diagnosed, &photographs, &views, &without_pose);
+        let (mut remarks, odd) = remarks(&diagnosed, &photographs, &views, &without_pose);
+        let names: Vec<&str> = views.iter().map(|(_, view)| view.name.as_str()).collect();
         let tracks = LampObservations::new(&shared.observations, views.len());
-        remarks.extend(tracks.as_ref().ok().and_then(bands::remark));
+        let shading = tracks.map(|tracks| shading(tracks, &names, shared.corner));
         remarks.extend(findings(&measured, Some(&exposure), 0.0));
         let mut scene = SceneDiagnosis::new(
             &diagnosed,
             photographs,
             &shared,
-            tracks,
+            shading,
             &exposure,
             dataset.points.len(),
         );
@@ -263,6 +286,7 @@ impl Diagnosis {
             test_views: dataset.test_views().count(),
             pixels: views.iter().map(|(_, view)| pixels(&view.camera)).sum(),
             remarks,
+            odd,
             without_pose,
             scene,
             views: diagnosed,
@@ -303,9 +327,11 @@ fn read(
         false => Borders::of_photographs(all, options),
         true => Borders::default(),
     };
+    let stage = Stage::begin("diagnosing photographs", files.len());
     let mut photographs = vec![];
     for files in files.chunks(decoded_at_once(largest)) {
         let read = files.par_iter().map(|file| {
+            stage.next()?;
             let name = file.name.clone();
             let load = || PhotographStatistics::load(file, options, &borders, balance, &colours);
             Ok((name, load()?))
@@ -369,7 +395,7 @@ impl SceneDiagnosis {
         views: &[ViewDiagnosis],
         photographs: Vec<PhotographStatistics>,
         shared: &SceneGeometry,
-        tracks: Result<LampObservations, String>,
+        shading: Result<(FalloffDiagnosis, BandsDiagnosis, LampObservations), String>,
         exposure: &Exposure,
         points: usize,
     ) -> Self {
@@ -379,8 +405,9 @@ impl SceneDiagnosis {
         let mean = |of: fn(&ViewDiagnosis) -> f64| {
             lit.iter().map(|view| of(view)).sum::<f64>() / lit.len().max(1) as f64
         };
-        let lamp = tracks.as_ref().map_err(Clone::clone).and_then(LampDiagnosis::new);
-        let falloff = tracks.ok().map(|tracks| FalloffDiagnosis::new(&tracks, shared.corner));
+        let tracks = shading.as_ref().map(|(.., tracks)| tracks).map_err(Clone::clone);
+        let lamp = tracks.and_then(LampDiagnosis::new);
+        let (falloff, bands) = shading.ok().map(|(falloff, bands, _)| (falloff, bands)).unzip();
         let is_lamp = lamp.as_ref().is_ok_and(LampDiagnosis::is_found);
         let measured = deviation(lit.iter().filter_map(|view| view.exposure));
         let light = mean(|view| view.light);
@@ -404,7 +431,7 @@ impl SceneDiagnosis {
             noise,
             noise_in_target: TargetNoise::median(lit.iter().filter_map(|one| one.noise_in_target)),
             target_noise: noise.map_or(0.0, |noise| target_noise(noise, light, exposure, shared)),
-            blur: geometry::median(lit.iter().filter_map(|view| view.blur).collect()),
+            blur: median(lit.iter().filter_map(|view| view.blur).collect()),
             unevenness: mean(|view| view.unevenness),
             overlap: mean(|view| view.overlap),
             views_per_point: shared.views_per_point,
@@ -413,6 +440,7 @@ impl SceneDiagnosis {
             lamp: lamp.ok(),
             // A lamp's light falls as well.
             falloff: falloff.filter(|_| !is_lamp),
+            bands,
         }
     }
 }
@@ -469,47 +497,57 @@ fn without_pose(
     Ok(names)
 }
 
-/// Remarks that a user should read before training.
+/// Remarks that a user should read before training, and what is odd about photographs, by name.
 fn remarks(
     views: &[ViewDiagnosis],
     photographs: &[PhotographStatistics],
     cameras: &[(usize, &View)],
     without_pose: &[String],
-) -> Vec<String> {
-    let mut remarks = vec![];
-    let named = |names: Vec<&str>| match names.len() {
-        0..=4 => names.join(", "),
-        more => format!("{}, and {} more", names[..3].join(", "), more - 3),
+) -> (Vec<String>, BTreeMap<String, String>) {
+    let (mut remarks, mut odd) = (vec![], BTreeMap::new());
+    let mut add_remark = |mut names: Vec<&str>, word: &str, what: &str| {
+        names.sort_by(|a, b| natural::compare(a, b));
+        for name in &names {
+            let words: &mut String = odd.entry((*name).to_owned()).or_default();
+            *words += &format!("{}{word}", if words.is_empty() { "" } else { ", " });
+        }
+        let named = match names.len() {
+            0 => return,
+            1..=4 => names.join(", "),
+            more => format!("{}, and {} more", names[..3].join(", "), more - 3),
+        };
+        remarks.push(format!("{} {what}: {named}", names.len()));
     };
     let names = |is: &dyn Fn(usize) -> bool| -> Vec<&str> {
         let views = views.iter().enumerate().filter(|(index, _)| is(*index));
         views.map(|(_, view)| view.name.as_str()).collect()
     };
-    let mut add_remark = |names: Vec<&str>, what: &str| {
-        if !names.is_empty() {
-            remarks.push(format!("{} {what}: {}", names.len(), named(names)));
-        }
-    };
-    add_remark(names(&|index| views[index].is_black), "black, left out of training");
+    add_remark(names(&|index| views[index].is_black), "black", "black, left out of training");
     let mut checksums = HashSet::new();
     let is_new: Vec<bool> = photographs.iter().map(|one| checksums.insert(one.checksum)).collect();
     let is_repeated = |index: usize| !is_new[index] && !views[index].is_black;
-    add_remark(names(&is_repeated), "identical to another photograph");
-    let blur = geometry::median(views.iter().filter_map(|view| view.blur).collect());
-    let [times, more] = BLURRED;
-    let is_blurred = |index: usize| {
-        let blurs = views[index].blur.zip(blur);
-        blurs.is_some_and(|(blur, median)| blur > times * median && blur > median + more)
+    add_remark(names(&is_repeated), "repeated", "identical to another photograph");
+    let blur = median(views.iter().filter_map(|view| view.blur).collect());
+    let blurred = |index: usize| {
+        views[index].blur.zip(blur).is_some_and(|(blur, median)| is_blurred(blur, median))
     };
-    add_remark(names(&is_blurred), "more blurred than the others");
-    add_remark(without_pose.iter().map(String::as_str).collect(), "without a pose, not used");
+    add_remark(names(&blurred), "blurred", "more blurred than the others");
+    let [stops, deviations] = ODD_EXPOSURE;
+    let spread = deviation(views.iter().filter_map(|view| view.exposure)).unwrap_or_default();
+    let of_odd_exposure = |index: usize| {
+        views[index].exposure.is_some_and(|ev| ev.abs() > stops.max(deviations * spread))
+    };
+    let far = names(&of_odd_exposure);
+    add_remark(far, "odd exposure", "much brighter or darker than others of the same points");
+    let without_pose = without_pose.iter().map(String::as_str).collect();
+    add_remark(without_pose, "without a pose", "without a pose, not used");
     let centers: Vec<_> = cameras.iter().map(|(_, view)| view.camera.center()).collect();
     if cameras.len() == 1 {
         remarks.push("one photograph gives no depth: other views will look wrong".to_owned());
     } else if centers.windows(2).all(|two| two[0].distance(two[1]) < 1e-9) {
         remarks.push("all cameras are at one position, which gives no depth".to_owned());
     }
-    remarks
+    (remarks, odd)
 }
 
 #[cfg(test)]

@@ -7,6 +7,7 @@ use toml::Value;
 
 use super::config::TrainConfig;
 use super::layers::values;
+use super::settings::setting;
 use crate::Result;
 
 /// Settings that affect no result beyond rounding: the dataset's path, saving and logging, time limits, and values that
@@ -32,7 +33,7 @@ const FREE: [&str; 17] = [
 ];
 
 impl TrainConfig {
-    /// The first setting that differs from `other`'s, with both values: `tone.alpha = 0.1, not 0.12`. Settings that
+    /// The first setting that differs from `other`'s, with both values: `tone.alpha = 0.1, not 0.12`; the curve before its constants. Settings that
     /// change no step beyond rounding do not count: the number of steps, paths, scoring and saving, device and tiles.
     /// Nor does a lower limit of the Gaussians, so that a run that ran out of memory can resume.
     pub(crate) fn difference(&self, other: &Self) -> Option<String> {
@@ -52,9 +53,14 @@ impl TrainConfig {
             |key: &String| key == "max_gaussians" && other.max_gaussians <= self.max_gaussians;
         let keys = values_here.keys().chain(others.keys());
         let is_free = |key: &str| FREE.contains(&key) || ALSO.contains(&key);
-        let mut keys = keys.filter(|key| !is_free(key) && !is_lower_limit(key));
-        keys.find(|&key| values_here.get(key) != others.get(key))
-            .map(|key| format!("{key} = {}, not {}", value(values_here, key), value(others, key)))
+        let differs = |key: &&String| {
+            !is_free(key) && !is_lower_limit(key) && values_here.get(*key) != others.get(*key)
+        };
+        // Another curve has other constants.
+        let key = keys.filter(differs).min_by_key(|key| *key != "tone.curve")?;
+        let option = setting(key).and_then(|row| row.option());
+        let option = option.map(|(option, _)| format!(" (--{option})")).unwrap_or_default();
+        Some(format!("{key}{option} = {}, not {}", value(values_here, key), value(others, key)))
     }
 
     /// A checksum of every setting that affects results.
@@ -91,6 +97,15 @@ mod tests {
             config.difference(&other).unwrap(),
             format!("tone.alpha = {}, not 0.25", config.tone.alpha)
         );
+        let mut curve = TrainConfig::default();
+        curve.tone = nightsplat_photographs::tone::ToneSettings::new(
+            nightsplat_photographs::tone::ToneCurve::Ap3,
+        );
+        assert_eq!(
+            config.difference(&curve).unwrap(),
+            "tone.curve (--curve) = \"auto\", not \"ap3\"",
+            "what the user gave, and not its constants"
+        );
         let other = TrainConfig {
             model: crate::train::ModelConfig {
                 depth_folder: Some("d".into()),
@@ -98,7 +113,10 @@ mod tests {
             },
             ..TrainConfig::default()
         };
-        assert_eq!(config.difference(&other).unwrap(), "model.depth_folder = nothing, not \"d\"");
+        assert_eq!(
+            config.difference(&other).unwrap(),
+            "model.depth_folder (--depth) = nothing, not \"d\""
+        );
     }
 
     #[test]

@@ -3,6 +3,7 @@
 use glam::UVec2;
 use nightsplat_core::camera::Camera;
 
+use super::call::Scored;
 use super::depth_seeding::{seed_depths, seeded_count, seeds_at};
 use super::model::{Density, MARGIN, TrainedModel};
 use super::rendered::Rendered;
@@ -53,14 +54,17 @@ impl Trainer {
         let affines = self.supervision.affines()?;
         let TrainedModel { gaussians, renderer, density, .. } = &mut self.model;
         let Density { densifier, probes, .. } = density;
-        let mut psnr = |gaussians: GaussianSlice<'_>| {
+        let call = &mut self.clock.submissions.call;
+        let mut psnr = |what: Scored, gaussians: GaussianSlice<'_>| {
             let show = |camera: &Camera| Rendered::new(renderer, gaussians, camera, &options, None);
-            Ok(probes.mean_psnr(&affines, show)?.map_or(0.0, |[colors, _]| colors))
+            let mean = probes.mean_psnr((call, what), &affines, show)?;
+            Ok(mean.map_or(0.0, |[colors, _]| colors))
         };
-        let before = psnr(gaussians.values.slice())?;
-        let mut after = before;
+        let before = psnr(Scored::Before, gaussians.values.slice())?;
+        let (mut after, mut trial) = (before, 0);
         let report = gaussians.densify(&self.gpu, densifier, round, |new| {
-            after = psnr(new)?;
+            trial += 1;
+            after = psnr(Scored::After(trial), new)?;
             Ok(share_that_stays(before - after))
         })?;
         tracing::debug!("step {}: {report:?}; probes {before:.3} -> {after:.3} dB", round.step);
@@ -91,6 +95,7 @@ mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
     use crate::targets::Targets;
+    use crate::train::call::Call;
     use crate::train::target_views::TargetViews;
     use crate::train::{Preset, TrainConfig};
     use nightsplat_photographs::dataset::Dataset;
@@ -112,7 +117,8 @@ mod tests {
             let affines = trainer.supervision.affines().unwrap();
             let degree = trainer.sh_degree_in_use();
             let show = |camera: &Camera| trainer.model.render(camera, degree, None);
-            let [colors, _] = views.mean_psnr(&affines, show).unwrap().unwrap();
+            let part = (&mut Call::default(), Scored::Model);
+            let [colors, _] = views.mean_psnr(part, &affines, show).unwrap().unwrap();
             colors
         };
         let mut losses = vec![];

@@ -3,13 +3,14 @@
 //! Each is a [`SettingsLayer`]: keys of config.toml with values. [`Settings`] merges them and keeps the origin of every
 //! value.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::input;
 use nightsplat_core::settings::{Rule, Setting};
-use nightsplat_photographs::tone::{OF_CURVE, ToneCurve};
+use nightsplat_photographs::tone::{OF_CURVE, Tone, ToneCurve};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
@@ -62,7 +63,8 @@ impl SettingsLayer {
     pub fn of_toml(text: &str, origin: &Origin) -> Result<Self> {
         let table: Table = text.parse().map_err(|error: toml::de::Error| {
             let at = error.span().map(|span| line_at(text, span.start));
-            Error::Usage(format!("is not TOML: {}{}", error.message(), at.unwrap_or_default()))
+            let (problem, at) = (error.message(), at.unwrap_or_default());
+            Error::Usage(format!("is not TOML: {problem}{at}; mend it or save it as UTF-8"))
         })?;
         let mut layer = Self::default();
         for (key, value) in flat("", table) {
@@ -111,6 +113,10 @@ impl SettingsLayer {
         let is_part = key.strip_prefix("tone.constants.").is_some_and(|name| !name.contains('.'));
         match setting(key) {
             Some(row) if takes(&row.rule, &value) => {}
+            // The nearest name, or what is wrong with a formula.
+            Some(Setting { key: Cow::Borrowed("tone.curve"), .. }) if value.is_str() => {
+                value.as_str().unwrap_or_default().parse::<Tone>()?;
+            }
             Some(row) => return Err(row.refused(value)),
             None if is_part && number(&value).is_some_and(f64::is_finite) => {}
             None => return Err(unknown(key)),
@@ -190,7 +196,7 @@ impl Settings {
         let constants = curve.map_or(&[][..], |curve: ToneCurve| curve.family().constants);
         constants
             .iter()
-            .map(|constant| (constant.name.to_owned(), constant.default.into()))
+            .map(|constant| (constant.name.to_string(), constant.default.into()))
             .collect()
     }
 
@@ -414,7 +420,7 @@ mod tests {
     fn a_single_constant_of_a_curve_can_be_set() {
         let family = ToneCurve::ALL.into_iter().find(|curve| !curve.family().constants.is_empty());
         let curve = family.unwrap();
-        let name = curve.family().constants[0].name;
+        let name = &curve.family().constants[0].name;
         let config = with(&[
             &format!("tone.curve={}", curve.name()),
             &format!("tone.constants.{name}=0.75"),

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use nightsplat_photographs::tone::Tone;
+
 use super::config::TrainConfig;
 
 impl TrainConfig {
@@ -29,7 +31,11 @@ impl TrainConfig {
         let Self { dataset, reference, init, tone, model, exposure, .. } = self;
         let optional =
             [reference, init, &mut tone.law, &mut model.depth_folder, &mut exposure.start];
-        let paths = optional.into_iter().flatten().chain([dataset]);
+        let targets = match &mut tone.curve {
+            Tone::External(folder) => Some(folder),
+            _ => None,
+        };
+        let paths = optional.into_iter().flatten().chain(targets).chain([dataset]);
         paths.filter(|path| !path.as_os_str().is_empty()).collect()
     }
 }

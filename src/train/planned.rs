@@ -6,11 +6,12 @@ use nightsplat_photographs::dataset::{Dataset, LoadOptions};
 use toml::Value;
 
 use super::config::TrainConfig;
-use super::diagnose::{Diagnosis, Plan};
+use super::diagnose::{Diagnosis, Plan, PlannedPart};
 use super::layers::{Origin, Settings, SettingsLayer};
 use super::preset::Preset;
 use super::trainer::Trainer;
 use crate::gpu::Gpu;
+use crate::targets::external::ExternalTargets;
 use crate::{Error, Result};
 
 /// Requested settings of a run in addition to its plan, from the lowest precedence to the highest.
@@ -100,8 +101,9 @@ impl RequestedSettings {
             _ => diagnosed(&config),
         };
         if let PlanSource::File(file) = planning {
-            let planned = Some(Plan::read(file)?.falloff).filter(|planned| planned.on);
-            options.falloff = options.falloff.or(planned.map(|planned| planned.falloff));
+            let Plan { falloff, bands, .. } = Plan::read(file)?;
+            options.falloff = options.falloff.or(falloff.on.then_some(falloff.falloff));
+            options.bands = options.bands.or(bands.on.then_some(bands.rows));
         }
         let (mut dataset, plan) = if planning == PlanSource::Diagnosis {
             let (dataset, diagnosis) = Diagnosis::load(&config.dataset, &options)?;
@@ -109,10 +111,20 @@ impl RequestedSettings {
         } else {
             (Dataset::load(&config.dataset, &options)?, None)
         };
-        let plan = match planning {
+        let mut plan = match planning {
             PlanSource::File(file) => Some(Plan::load(file, &dataset)?),
             _ => plan,
         };
+        if let Some(folder) = config.tone.targets() {
+            let found = ExternalTargets::check(folder, &dataset)?;
+            match &mut plan {
+                Some(plan) => plan.curve = PlannedPart { on: false, why: found.sentence() },
+                None => tracing::info!("{}", found.sentence()),
+            }
+            if let Some(problem) = found.problem() {
+                tracing::warn!("{}: {problem}", folder.display());
+            }
+        }
         if let Some(plan) = &plan {
             dataset.leave_out(&plan.left_out);
         }

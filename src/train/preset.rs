@@ -75,7 +75,8 @@ impl Preset {
     }
 
     /// Whether a run with this preset is planned by a diagnosis of its photographs.
-    pub(crate) fn is_planned(self) -> bool {
+    #[doc(hidden)]
+    pub fn is_planned(self) -> bool {
         matches!(self, Self::Draft | Self::Fast | Self::Balanced | Self::Best)
     }
 

@@ -2,6 +2,7 @@
 
 use nightsplat_core::camera::Camera;
 
+use super::call::{Call, Scored};
 use super::decisions::{HeldOutScore, PATIENCE, RecordedRound};
 use super::early_stopping::Ended;
 use super::model::TrainedModel;
@@ -17,14 +18,19 @@ impl Trainer {
     /// held-out views.
     #[doc(hidden)]
     pub fn held_out_psnr(&mut self) -> Result<Option<f64>> {
-        self.held_out_psnr_of_degree(self.clock.sh_degree(self.clock.step))
+        let mut whole = Call::default();
+        std::mem::swap(&mut whole, &mut self.clock.submissions.call);
+        let psnr = self.held_out_psnr_for(Scored::Model, self.clock.sh_degree(self.clock.step));
+        std::mem::swap(&mut whole, &mut self.clock.submissions.call);
+        psnr
     }
 
-    /// [`Trainer::held_out_psnr`] with a given SH degree.
-    fn held_out_psnr_of_degree(&mut self, sh_degree: u32) -> Result<Option<f64>> {
+    /// [`Trainer::held_out_psnr`] with a given SH degree, as far as the call has time.
+    fn held_out_psnr_for(&mut self, what: Scored, sh_degree: u32) -> Result<Option<f64>> {
         let affines = self.supervision.affines()?;
-        let Self { supervision: Supervision { held_out, networks, .. }, model, .. } = self;
-        let psnr = held_out.mean_psnr(&affines, renders(model, networks, sh_degree))?;
+        let Self { supervision: Supervision { held_out, networks, .. }, model, clock, .. } = self;
+        let part = (&mut clock.submissions.call, what);
+        let psnr = held_out.mean_psnr(part, &affines, renders(model, networks, sh_degree))?;
         Ok(psnr.map(|[colors, _]| colors))
     }
 
@@ -34,7 +40,9 @@ impl Trainer {
         let (step, affines) = (self.clock.step, self.supervision.affines()?);
         let Self { supervision: Supervision { held_out, networks, .. }, model, clock, .. } = self;
         let renders = renders(model, networks, clock.sh_degree(step));
-        let scores = held_out.mean_psnr_and_detail(&affines, renders)?;
+        let part = (&mut clock.submissions.call, Scored::Model);
+        let scores = held_out.mean_psnr_and_detail(part, &affines, renders)?;
+        clock.submissions.call.decided(Scored::Model);
         let Some([psnr, detail]) = scores else { return Ok(()) };
         let [score, detail] = [1e3 * psnr, 1e6 * detail].map(|score| score.round() as i64);
         let score = HeldOutScore { step, score, detail };
@@ -68,7 +76,11 @@ impl Trainer {
         // A score taken before memory ran out is not taken again.
         let is_scored = self.clock.decisions.rounds.last().is_some_and(|round| round.step == step);
         if growth_gain > 0.0 && self.clock.decisions.gaussians.is_none() && step >= whole {
-            let psnr = if is_scored { None } else { self.held_out_psnr()? };
+            let degree = self.clock.sh_degree(step);
+            let psnr = match is_scored {
+                true => None,
+                false => self.held_out_psnr_for(Scored::Growth, degree)?,
+            };
             if let Some(psnr) = psnr {
                 let score = (1e3 * psnr).round() as i64;
                 self.clock.decisions.rounds.push(RecordedRound { step, score, gaussians });
@@ -89,8 +101,8 @@ impl Trainer {
     pub(super) fn decide_degree(&mut self) -> Result<()> {
         let step = self.clock.step;
         let (degree, least) = (self.clock.sh_degree(step), self.config.stop.degree_gain);
-        let with = self.held_out_psnr_of_degree(degree)?;
-        let without = self.held_out_psnr_of_degree(degree - 1)?;
+        let with = self.held_out_psnr_for(Scored::Degree(degree), degree)?;
+        let without = self.held_out_psnr_for(Scored::Degree(degree - 1), degree - 1)?;
         let Some((with, without)) = with.zip(without) else { return Ok(()) };
         let gain = with - without;
         if gain >= least {
@@ -146,7 +158,8 @@ impl Trainer {
             false => None,
         };
         let renders = renders(model, networks, clock.sh_degree(clock.step));
-        let scores = training.as_ref().unwrap_or(held_out).mean_psnr(&affines, renders)?;
+        let part = (&mut Call::default(), Scored::Model);
+        let scores = training.as_ref().unwrap_or(held_out).mean_psnr(part, &affines, renders)?;
         let Some([colors, denoised]) = scores else { return Ok(()) };
         let gain = denoised - colors;
         if gain >= MIN_GAIN {

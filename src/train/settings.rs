@@ -3,7 +3,7 @@
 use std::sync::LazyLock;
 
 use nightsplat_core::camera::TrainingFrame;
-use nightsplat_core::settings::{Rule, Setting};
+use nightsplat_core::settings::{Rule, Setting, distance};
 use nightsplat_photographs::tone::ToneSettings;
 use toml::{Table, Value};
 
@@ -121,22 +121,6 @@ pub(super) fn unknown(key: &str) -> Error {
     Error::Usage(format!("no setting is called `{key}`{hint}"))
 }
 
-/// The Levenshtein distance of a name to the nearest beginning of another, so that half a name is close to the whole,
-/// and to the whole.
-fn distance(from: &str, to: &str) -> [usize; 2] {
-    let to: Vec<char> = to.chars().collect();
-    let mut row: Vec<usize> = (0..=to.len()).collect();
-    for (deleted, from) in from.chars().enumerate() {
-        let mut diagonal = std::mem::replace(&mut row[0], deleted + 1);
-        for (column, &to) in to.iter().enumerate() {
-            let replaced = diagonal + usize::from(from != to);
-            diagonal = row[column + 1];
-            row[column + 1] = replaced.min(diagonal + 1).min(row[column] + 1);
-        }
-    }
-    [row.iter().copied().min().unwrap_or_default(), row[to.len()]]
-}
-
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;
@@ -177,6 +161,7 @@ mod tests {
             "extent=2",
             "light=linear",
             "falloff=1",
+            "bands={}",
             "schedule.first_sh_degree=1",
         ];
         set.extend(rest.map(str::to_owned));
@@ -190,7 +175,8 @@ mod tests {
         assert_eq!(keys.len(), rows.len(), "a key has two rows");
         let mut written: BTreeSet<String> = values(&whole()).unwrap().into_keys().collect();
         // These belong to a curve.
-        written.extend(["tone.constants", "tone.table", "tone.profile"].map(str::to_owned));
+        let of_curves = ["constants", "bounds", "table", "profile", "targets"];
+        written.extend(of_curves.map(|name| format!("tone.{name}")));
         assert_eq!(written, rows.into_iter().map(str::to_owned).collect());
         let options: Vec<_> =
             SETTINGS.iter().filter_map(|row| row.option()).map(|(name, _)| name).collect();

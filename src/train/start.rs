@@ -6,7 +6,9 @@ use std::sync::Arc;
 use std::thread::{self, ScopedJoinHandle};
 
 use glam::UVec2;
-use nightsplat_photographs::dataset::{Dataset, Fingerprint, Original, Split};
+use nightsplat_core::camera::CameraModel;
+use nightsplat_core::watch::Watch;
+use nightsplat_photographs::dataset::{Dataset, Fingerprint, Original, Split, View};
 use nightsplat_photographs::scene_tone::SceneTone;
 
 use super::batching::MAX_STEPS;
@@ -31,6 +33,17 @@ use crate::loss::{LossLog, ParameterTerms};
 use crate::splats::scene::{FEATURES, Gaussians, Shape, ply};
 use crate::targets::Targets;
 use crate::{Error, Result};
+
+/// Refuses views whose cameras have no gradients.
+fn refuse_orthographic(dataset: &Dataset) -> Result<()> {
+    let is_orthographic = |view: &&View| view.camera.model == CameraModel::Orthographic;
+    match dataset.views.iter().find(is_orthographic) {
+        Some(View { name, .. }) => Err(Error::Usage(format!(
+            "view {name} has an orthographic camera, which has no gradients; leave it out"
+        ))),
+        None => Ok(()),
+    }
+}
 
 impl TrainConfig {
     /// The Gaussians of a file of [`TrainConfig::init`] in the shape of the configured model; further features are
@@ -105,16 +118,19 @@ impl Trainer {
         initial: &Initial,
     ) -> Result<Self> {
         config.check()?;
+        refuse_orthographic(dataset)?;
         config.disable_missing_parts(dataset);
         config.frame.get_or_insert_with(|| dataset.frame());
         thread::scope(|scope| {
             // Pipelines are compiled on another thread while the views are uploaded and measured.
-            let config_of_thread = config.clone();
+            let (config_of_thread, watch) = (config.clone(), Watch::current());
             let beside = scope.spawn(move || {
-                Ok((
-                    TrainKernels::new(gpu, &config_of_thread, dataset)?,
-                    Fingerprint::compute(dataset)?,
-                ))
+                watch.within(|| {
+                    Ok((
+                        TrainKernels::new(gpu, &config_of_thread, dataset)?,
+                        Fingerprint::compute(dataset)?,
+                    ))
+                })
             });
             Self::assemble(gpu, config, dataset, initial, beside)
         })

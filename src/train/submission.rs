@@ -8,6 +8,8 @@ use std::collections::VecDeque;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
+use nightsplat_core::watch::Stage;
+
 use super::batching::StepBatching;
 use super::config::NotFinite;
 use super::model::TrainedModel;
@@ -66,14 +68,19 @@ impl Trainer {
     fn train_interval(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
         // A run resumed after running out of memory starts with what was due.
         self.control()?;
+        if self.clock.decisions.are_due() {
+            return Ok(());
+        }
         self.train_steps(until, reports)?;
+        self.clock.submissions.call.has_worked = true;
         self.control()
     }
 
     /// Trains up to `until`, up to the next step with an action due, or for about half a second.
     pub(super) fn train_steps(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
         self.allocate_sh_degree()?;
-        let (begin, mut next) = (Instant::now(), self.clock.step + 1);
+        let (begin, mut next) = (self.clock.submissions.call.begin, self.clock.step + 1);
+        let stage = Stage::begin("training", self.config.steps as usize);
         let until = until.min(self.last_step());
         let last = (next..until).find(|&step| self.clock.pauses_at(step)).unwrap_or(until);
         let (mut in_flight, mut sent) = (VecDeque::new(), Ok(()));
@@ -91,7 +98,8 @@ impl Trainer {
                 }
                 let steps = next..=last.min(next + self.clock.submissions.batching.steps() - 1);
                 // If one cannot be submitted, those before it still change the model.
-                sent = self.load_and_submit(steps).map(|submitted| {
+                let goes_on = stage.at(*steps.start() as usize - 1);
+                sent = goes_on.and_then(|()| self.load_and_submit(steps)).map(|submitted| {
                     next = submitted.steps.end() + 1;
                     in_flight.push_back(submitted);
                 });
@@ -114,8 +122,16 @@ impl Trainer {
         sent
     }
 
-    /// Performs the actions due after the last step. An action that fails leaves the model unchanged and stays due.
+    /// Performs the actions due after the last step, as far as the call has time. An action that fails leaves the model
+    /// unchanged and stays due.
     pub(super) fn control(&mut self) -> Result<()> {
+        match self.act() {
+            Err(Error::Halted { .. }) if self.clock.submissions.call.is_over => Ok(()),
+            done => done,
+        }
+    }
+
+    fn act(&mut self) -> Result<()> {
         if self.clock.decisions.score_due {
             self.score_held_out()?;
             self.clock.decisions.score_due = false;
@@ -130,6 +146,7 @@ impl Trainer {
             self.decide_degree()?;
             self.clock.decisions.degree_due = false;
         }
+        self.clock.submissions.call.settle();
         Ok(())
     }
 

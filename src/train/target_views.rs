@@ -7,6 +7,7 @@ use nightsplat_photographs::image::{Image, Mask};
 use nightsplat_photographs::metrics::{Scores, psnr_of_counted};
 use nightsplat_photographs::tone::{LuminanceHistogram, is_black};
 
+use super::call::{Call, Scored};
 use super::rendered::Rendered;
 use super::views::{ImageKind, TrainingPhotograph, Views};
 use crate::Result;
@@ -91,22 +92,25 @@ impl TargetViews {
 
     /// The mean PSNR, dB, of colours and output of `render` for each camera; `None` without views. `affines` are the
     /// exposures of the training photographs; where these are learned, a view of unknown exposure is compared after the
-    /// least-squares gain and bias of each channel, since its brightness says nothing about the model.
+    /// least-squares gain and bias of each channel, since its brightness says nothing about the model. The call is that
+    /// in which they are scored.
     pub(super) fn mean_psnr(
         &self,
+        (call, what): (&mut Call, Scored),
         affines: &[Affine],
         mut render: impl FnMut(&Camera) -> Result<Rendered>,
     ) -> Result<Option<[f64; 2]>> {
-        self.mean(|view| view.psnr(affines, &render(&view.camera)?))
+        self.mean(call, what, |view| view.psnr(affines, &render(&view.camera)?))
     }
 
     /// The mean PSNR of the colours as [`Self::mean_psnr`], dB, and their mean detail.
     pub(super) fn mean_psnr_and_detail(
         &self,
+        (call, what): (&mut Call, Scored),
         affines: &[Affine],
         mut render: impl FnMut(&Camera) -> Result<Rendered>,
     ) -> Result<Option<[f64; 2]>> {
-        self.mean(|view| {
+        self.mean(call, what, |view| {
             let rendered = render(&view.camera)?;
             let [colors, _] = view.psnr(affines, &rendered)?;
             Ok([colors, view.detail(&rendered)?])
@@ -116,11 +120,13 @@ impl TargetViews {
     /// The means of two scores over the views; `None` without views.
     fn mean(
         &self,
-        mut scores_of: impl FnMut(&TargetView) -> Result<[f64; 2]>,
+        call: &mut Call,
+        what: Scored,
+        scores_of: impl FnMut(&TargetView) -> Result<[f64; 2]>,
     ) -> Result<Option<[f64; 2]>> {
         let mut sums = [0.0; 2];
-        for view in &self.0 {
-            for (sum, score) in sums.iter_mut().zip(scores_of(view)?) {
+        for scores in call.scores(what, &self.0, scores_of)? {
+            for (sum, score) in sums.iter_mut().zip(scores) {
                 *sum += score;
             }
         }

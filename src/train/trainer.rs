@@ -233,6 +233,11 @@ impl Trainer {
     /// splats than the device can process, [`Error::Disagrees`] if a checked step differs from its references and
     /// [`TrainConfig::check`] says to stop, or the device is out of memory or lost.
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
+        self.clock.submissions.call.next(None);
+        self.advance_call(until)
+    }
+
+    fn advance_call(&mut self, until: u64) -> Result<Vec<StepReport>> {
         let _phase = tracing::info_span!("steps").entered();
         let step = self.clock.step;
         if until > step && step < self.config.steps && self.has_ended() {
@@ -249,16 +254,24 @@ impl Trainer {
         }
     }
 
-    /// [`Trainer::advance`] for about `budget` instead of half a second. A call takes a step at the least; density
-    /// control and the scores of held-out views, where they are due, come on top.
+    /// [`Trainer::advance`] for about `budget` instead of half a second. Held-out views are scored, and the cost of a
+    /// round of density control is measured, in parts: a call that does no more than that reports no step. A call takes
+    /// a step or scores a view at the least. The model has the same bits as after [`Trainer::advance`].
     ///
     /// # Errors
     /// Those of [`Trainer::advance`].
     pub fn advance_within(&mut self, until: u64, budget: Duration) -> Result<Vec<StepReport>> {
+        self.clock.submissions.call.next(Some(budget));
         self.clock.submissions.batching.budget = budget;
-        let reports = self.advance(until);
+        let reports = self.advance_call(until);
         self.clock.submissions.batching.budget = CALL;
         reports
+    }
+
+    /// Whether scores or density control are due before the next step, or before the end
+    /// ([`Trainer::advance_within`]).
+    pub fn is_due(&self) -> bool {
+        self.clock.decisions.are_due()
     }
 
     /// The Gaussians as they are now, in the dataset's world, to draw without a copy. The next call that trains changes

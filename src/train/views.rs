@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use glam::UVec2;
 use nightsplat_core::camera::Patch;
+use nightsplat_core::watch::Stage;
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::scene_tone::photographs;
@@ -92,7 +93,9 @@ impl Views {
         let mut levels = vec![];
         levels.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
         let mut curves = vec![];
+        let stage = Stage::begin("uploading photographs", photographs(dataset).count());
         for (at, (index, view)) in photographs(dataset).enumerate() {
+            stage.next()?;
             let Some(tone_mapping) = scene.tone_mapping(view)? else { continue };
             curves.push(tone_mapping.parameters);
             let Some(image) = view.loaded()? else { continue };
@@ -106,6 +109,7 @@ impl Views {
             let whole = if is_larger.is_some() { view.photograph()? } else { None };
             let whole =
                 whole.map(|whole| pseudo_gt.tone_mapped(&whole, &tone_mapping)).transpose()?;
+            let whole = targets.external(view)?.or(whole);
             for (views, size) in levels.iter_mut().zip(sizes) {
                 let resized = |whole: &Image| view.blacked_out(whole.resized(size.x, size.y));
                 let camera = frame.camera(&view.camera).resized(size.x, size.y);

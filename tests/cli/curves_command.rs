@@ -71,12 +71,13 @@ fn curves_are_drawn_with_the_statistics_of_a_dataset() {
 }
 
 #[test]
-fn a_plot_without_names_shows_six_curves_and_explains_how_to_choose_others() {
+fn a_plot_without_names_shows_every_curve_that_is_listed() {
     let folder = tempfile::tempdir().unwrap();
     let svg = folder.path().join("curves.svg");
     let message = printed(&format!("--plot {}", svg.display()));
-    assert!(message.contains("6 curves; name curves to plot others"), "{message}");
-    assert_eq!(std::fs::read_to_string(svg).unwrap().matches("<polyline").count(), 6);
+    let all = FAMILIES.len() + 1;
+    assert!(message.contains(&format!("{all} curves")), "{message}");
+    assert_eq!(std::fs::read_to_string(svg).unwrap().matches("<polyline").count(), all);
 }
 
 #[test]
@@ -84,4 +85,23 @@ fn an_unknown_curve_is_misuse() {
     let error = parse("gama").unwrap_err();
     assert_eq!(error.exit_code(), 2);
     assert!(error.to_string().contains("sinh_ratio"));
+}
+
+#[test]
+fn a_formula_is_listed_tabulated_and_plotted_by_its_text() {
+    let text = "a*t/(t+b);a=1.2;b=0.3";
+    let listing = printed(text);
+    assert!(
+        listing.contains("a*t/(t+b); a = 1.2; b = 0.3\n    a formula of your own"),
+        "{listing}"
+    );
+    let values = printed(&format!("{text} t^0.45 --table --at 0.3,1"));
+    assert!(values.contains("0.600") && values.contains("0.923"), "{values}");
+    let folder = tempfile::tempdir().unwrap();
+    let svg = folder.path().join("curves.svg");
+    printed(&format!("{text} t^0.45 ap3 --plot {}", svg.display()));
+    let svg = std::fs::read_to_string(svg).unwrap();
+    assert!(svg.contains("a*t/(t+b); a = 1.2; b = 0.3") && svg.contains("t^0.45"), "{svg}");
+    let message = parse("gama").unwrap_err().to_string();
+    assert!(message.contains("the nearest is `gamma`"), "{message}");
 }

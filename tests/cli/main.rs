@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 use nightsplat::kernels;
 use nightsplat::networks::lpips::Network;
 use nightsplat_photographs::image::{Image, ImageFile};
-use nightsplat_photographs::metrics::Scores;
+use nightsplat_photographs::metrics::{self, Scores};
 use serde_json::Value;
 
 mod blocks;
@@ -199,6 +199,22 @@ fn eval_agrees_with_train_and_saves_the_scored_images() {
 }
 
 #[test]
+fn eval_adds_ssim_with_a_uniform_window_on_request() {
+    let fixture = fixture();
+    let eval = format!("eval {} --uniform-ssim", fixture.run());
+    let scores: Value =
+        serde_json::from_str(&succeed(&format!("{eval} --json --save-images"))).unwrap();
+    for name in ["000", "008"] {
+        let path = |kind: &str| fixture.path("run").join("eval").join(kind).join(name);
+        let load = |kind: &str| Image::load(path(kind).with_extension("png")).unwrap();
+        let expected = metrics::ssim_uniform(&load("renders"), &load("references")).unwrap();
+        let scored = scores["views"][name]["ssim_uniform"].as_f64().unwrap();
+        assert!((scored - expected).abs() < 1e-4, "{name}: {scored}, not {expected}");
+    }
+    assert!(succeed(&eval).lines().next().unwrap().contains("SSIM, uniform"));
+}
+
+#[test]
 fn eval_scores_lpips_with_given_weights() {
     let fixture = fixture();
     let weights = fixture.path("weights.safetensors");
@@ -329,8 +345,9 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
     let elsewhere = "\
         conv3x3_half conv3x3_weight_gradient_half conv_strided \
         depth_limits expose expose_backward exposure_center exposure_gradient first_not_finite lamp_backward \
-        lamp_gradient largest_magnitude mask_gradient mask_render max_pool pack_map pack_pixels pack_weights \
-        parameter_terms photograph_light place_pairs self_test smoothing_floor sort_tiles tile_begins";
+        lamp_gradient largest_magnitude mask_gradient mask_render max_pool motion_vectors pack_map pack_pixels \
+        pack_weights parameter_terms photograph_light pick_splats place_pairs self_test smoothing_floor sort_tiles \
+        tile_begins";
     assert_eq!(everywhere.collect::<Vec<_>>().join(" "), elsewhere);
     let mut named = [keys(&printed["errors"]), not_covered].concat();
     named.sort_unstable();

@@ -192,6 +192,88 @@ fn an_output_that_cannot_be_written_is_refused_before_anything_is_read() {
     }
 }
 
+/// `nightsplat` with arguments, in a shell after these words.
+#[cfg(unix)]
+fn after(shell: &str, arguments: &str) -> std::process::Output {
+    let nightsplat = command(arguments);
+    let mut sh = std::process::Command::new("sh");
+    sh.args(["-c", &format!("{shell}; exec \"$0\" \"$@\"")]).arg(nightsplat.get_program());
+    sh.args(nightsplat.get_args());
+    sh.envs(nightsplat.get_envs().filter_map(|(name, value)| Some((name, value?))));
+    sh.output().unwrap()
+}
+
+#[cfg(unix)]
+#[test]
+fn a_limit_of_the_size_of_files_is_an_error_that_names_the_file_and_a_full_disk_ends_help() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("edited.ply");
+    let edit = format!("edit {}/model.ply --up 0,-1,0 --out {}", fixture().run(), out.display());
+    let output = after("ulimit -f 4", &edit);
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    assert!(stderr.contains("edited.ply: cannot be written (File too large"), "{stderr}");
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "a partial file");
+    if Path::new("/dev/full").exists() {
+        let output = after("exec > /dev/full", "train --help");
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{stderr}");
+        assert!(stderr.starts_with("error: help cannot be written"), "{stderr}");
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn an_address_space_without_room_for_a_driver_is_named_however_small_it_is() {
+    for mebibytes in [150, 400] {
+        let output = after(&format!("ulimit -v {}", mebibytes << 10), "doctor");
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(4), "{stderr}");
+        assert!(stderr.contains("raise `ulimit -v`"), "{mebibytes}: {stderr}");
+    }
+}
+
+#[test]
+fn a_model_that_is_refused_names_its_remedy() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let whole = fs::read(fixture().path("run/model.ply")).unwrap();
+    let header = whole.windows(10).position(|bytes| bytes == b"end_header").unwrap() + 11;
+    let text = String::from_utf8(whole[..header].to_vec()).unwrap();
+    let changed = |from: &str, to: &str| {
+        assert!(text.contains(from));
+        [text.replacen(from, to, 1).as_bytes(), &whole[header..]].concat()
+    };
+    let again = "export the model again";
+    for (name, bytes, parts) in [
+        ("cut.ply", whole[..whole.len() - 3].to_vec(), ["is truncated", again]),
+        ("list.ply", changed("float x", "list uchar float x"), ["list property", again]),
+        ("int.ply", changed("float x", "int x"), ["of type int, not float", again]),
+        ("near.ply", changed("near ", "near -"), ["states near", again]),
+        ("a.spz", vec![0x1F, 0x8B, 0], ["cannot be unpacked", again]),
+        ("a.sog", b"PK\x03\x04".to_vec(), ["is not a SOG", again]),
+        ("empty.ply", vec![], ["neither PLY, SPZ nor SOG", "a run directory"]),
+    ] {
+        fs::write(path(name), bytes).unwrap();
+        let [model, out] = [name, "out.spz"].map(|name| path(name).display().to_string());
+        refused(
+            &format!("export {model} --format spz --out {out}"),
+            3,
+            &[&[name][..], &parts].concat(),
+        );
+    }
+    // More than there is memory.
+    fs::write(path("long.ply"), "no model").unwrap();
+    fs::File::options().write(true).open(path("long.ply")).unwrap().set_len(1 << 43).unwrap();
+    let long = format!("edit {} --up 0,-1,0 --out x.ply", path("long.ply").display());
+    refused(&long, 3, &["long.ply", "neither PLY, SPZ nor SOG"]);
+    fs::write(path("scan.zip"), "PK").unwrap();
+    let [zip, out] = ["scan.zip", "run"].map(|name| path(name).display().to_string());
+    let train = format!("train {} --out {out} --steps 1 --plan none", fixture().set());
+    let (_, stderr) = run(&format!("{train} --init {zip}/model.ply"), 3);
+    assert!(stderr.contains("model.ply: is within") && stderr.contains("extract it"), "{stderr}");
+}
+
 #[test]
 fn the_number_of_steps_has_short_forms_and_the_alias_iterations() {
     let folder = tempfile::tempdir().unwrap();

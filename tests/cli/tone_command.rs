@@ -8,6 +8,8 @@ use nightsplat_photographs::image::{Image, ImageFile, srgb_from_linear};
 use nightsplat_photographs::metrics::psnr;
 use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
 
+use crate::common::command::succeed;
+
 #[derive(Debug, clap::Parser)]
 struct ToneApply {
     #[command(flatten)]
@@ -52,8 +54,10 @@ fn a_folder_is_mapped_by_name_and_unreadable_files_are_left_out() {
             let statistics = Statistics::new(&image.data);
             let before = views[name].before;
             assert_eq!([before.p10, before.p90], statistics.percentiles());
-            let paper = ToneSettings::new(ToneCurve::Ap3).offset(statistics.printed_ratio());
-            assert!((views[name].delta0 - paper).abs() < 1e-6);
+            // Curves without a black level have no delta0.
+            let black_level = settings.offset(statistics.printed_ratio());
+            let is_raised = matches!(curve, ToneCurve::Ase | ToneCurve::Ap3);
+            assert_eq!(views[name].delta0, is_raised.then_some(black_level), "{curve}");
             let parameters = settings.parameters(&statistics);
             let mapped = Image::load(out.join(name).with_extension("png")).unwrap();
             assert_eq!((mapped.width, mapped.height), (image.width, image.height));
@@ -173,6 +177,37 @@ fn references_give_scores_and_the_page_shows_the_distributions() {
     dark(9, 9).save_png8(high.join("b.png")).unwrap();
     let error = apply(&args).unwrap_err().to_string();
     assert!(error.contains("b.png") && error.contains("9x9") && error.contains("45x30"), "{error}");
+}
+
+#[test]
+fn the_page_shows_every_photograph_and_tables_have_what_the_curve_uses() {
+    let dir = tempfile::tempdir().unwrap();
+    let folder = dir.path().join("dark");
+    std::fs::create_dir(&folder).unwrap();
+    for name in ["1", "2", "10", "11", "9"] {
+        dark(40, 30).save_png8(folder.join(format!("{name}.png"))).unwrap();
+    }
+    let table = dir.path().join("curve.csv");
+    std::fs::write(&table, "0,0\n1,0.7\n2,1\n").unwrap();
+    let (page, folder) = (dir.path().join("page.html"), folder.display());
+    let printed = |curve: &str| {
+        succeed(&format!("tone apply {folder} --curve {curve} --report {}", page.display()))
+    };
+    let ap3 = printed("ap3");
+    let html = std::fs::read_to_string(&page).unwrap();
+    assert_eq!(html.matches("data:image/jpeg").count(), 10, "five photographs, dark and lit");
+    for text in [&ap3, &html] {
+        let at = |name: &str| text.find(name).unwrap();
+        assert!(text.contains("delta0") && !text.contains("PSNR"), "{text}");
+        assert!(text.contains("lit white %"), "{text}");
+        let [nine, ten] = match text.contains("<html") {
+            true => ["alt=\"9, lit\"", "alt=\"10, lit\""].map(at),
+            false => ["\n9 ", "\n10 "].map(at),
+        };
+        assert!(nine < ten, "{text}");
+    }
+    let of_table = printed(&table.display().to_string());
+    assert!(!of_table.contains("delta0") && !of_table.contains(" r "), "{of_table}");
 }
 
 #[test]

@@ -50,6 +50,11 @@ pub(crate) fn refused_with(
     }
 }
 
+/// A text without the line breaks of its paragraphs.
+pub(crate) fn unwrapped(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
 /// Whether a program is on the path.
 pub(crate) fn exists(program: &str) -> bool {
     let path = std::env::var_os("PATH").unwrap_or_default();

@@ -151,6 +151,7 @@ impl Setup {
                 distortion: lens.coefficients,
                 largest_angle: lens.largest_angle(),
             }),
+            CameraModel::Orthographic => ReferenceLens::Orthographic,
         };
         ReferenceCamera { rotation, translation, focal, principal_point, size, model }
     }

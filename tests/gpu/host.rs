@@ -463,10 +463,16 @@ fn aspects(format: ImageFormat) -> vk::ImageAspectFlags {
 pub(crate) fn vulkan(format: ImageFormat) -> vk::Format {
     match format {
         ImageFormat::Rgba16Float => vk::Format::R16G16B16A16_SFLOAT,
+        ImageFormat::Rgba32Float => vk::Format::R32G32B32A32_SFLOAT,
+        ImageFormat::B10G11R11Float => vk::Format::B10G11R11_UFLOAT_PACK32,
+        ImageFormat::A2B10G10R10Unorm => vk::Format::A2B10G10R10_UNORM_PACK32,
+        ImageFormat::A2R10G10B10Unorm => vk::Format::A2R10G10B10_UNORM_PACK32,
         ImageFormat::Rgba8Unorm => vk::Format::R8G8B8A8_UNORM,
         ImageFormat::Rgba8Srgb => vk::Format::R8G8B8A8_SRGB,
         ImageFormat::Bgra8Unorm => vk::Format::B8G8R8A8_UNORM,
         ImageFormat::Bgra8Srgb => vk::Format::B8G8R8A8_SRGB,
+        ImageFormat::Rg16Float => vk::Format::R16G16_SFLOAT,
+        ImageFormat::Rg32Float => vk::Format::R32G32_SFLOAT,
         ImageFormat::R32Float => vk::Format::R32_SFLOAT,
         ImageFormat::D32Float => vk::Format::D32_SFLOAT,
         ImageFormat::D32FloatS8 => vk::Format::D32_SFLOAT_S8_UINT,

@@ -6,6 +6,7 @@ mod frames;
 mod instances;
 mod kernels;
 pub(crate) mod photograph;
+mod picks;
 
 use ash::vk::Handle as _;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
@@ -26,7 +27,7 @@ use nightsplat_core::random::Stream;
 
 use crate::common::{Random, not_run};
 use crate::host::{Host, Picture, usual_extensions, with_host};
-use kernels::halves;
+use kernels::{random_word, words_of};
 
 pub(crate) const SIZE: [u32; 2] = [48, 40];
 const PIXELS: usize = 48 * 40;
@@ -124,46 +125,85 @@ fn planes(camera: &Camera) -> (Vec<f32>, Vec<f32>) {
     (planes, transmittances)
 }
 
-/// A display-referred value as an image counts it.
-fn encoded(encoding: u32, c: f32) -> f32 {
-    match encoding {
-        pixels::PIXELS_LINEAR_HALF | pixels::PIXELS_SRGB => {
-            (1.5 * pack_pixels_reference::eotf(c.into())) as f32
+/// A format, how it stores a pixel, and what its colours are.
+#[derive(Clone, Copy, Debug)]
+struct Stored {
+    format: ImageFormat,
+    storage: u32,
+    light: u32,
+    swaps: u32,
+}
+
+impl Stored {
+    const fn new(format: ImageFormat, storage: u32, light: u32, swaps: u32) -> Self {
+        Self { format, storage, light, swaps }
+    }
+
+    /// Of an image.
+    fn words(self) -> usize {
+        words_of(self.storage) * PIXELS
+    }
+
+    fn hdr10_nits(self) -> Option<f32> {
+        (self.light == pixels::LIGHT_HDR10).then_some(NITS)
+    }
+
+    /// A display-referred value as the image counts it.
+    fn counted(self, c: f32) -> f32 {
+        match self.light {
+            pixels::LIGHT_DISPLAY => c,
+            _ => (1.5 * pack_pixels_reference::eotf(c.into())) as f32,
         }
-        _ => c,
+    }
+
+    /// Words of any pixels.
+    fn random(self, random: &mut Random) -> Vec<u32> {
+        (0..self.words()).map(|_| random_word(self.storage, random)).collect()
     }
 }
 
-/// What an image should hold, by the reference of the kernel that packs pixels.
-fn expected(camera: &Camera, encoding: u32, swaps: u32, under: Option<&[u32]>) -> Vec<u32> {
-    let (render, transmittances) = planes(camera);
-    packed((&render, &transmittances), encoding, swaps, under)
-}
+/// Of light 1 in HDR10.
+const NITS: f32 = 203.0;
+
+const COLOR_FORMATS: [Stored; 12] = [
+    Stored::new(ImageFormat::Rgba16Float, pixels::STORED_HALVES, pixels::LIGHT_LINEAR, 0),
+    Stored::new(ImageFormat::Rgba32Float, pixels::STORED_FLOATS, pixels::LIGHT_LINEAR, 0),
+    Stored::new(ImageFormat::B10G11R11Float, pixels::STORED_SMALL_FLOATS, pixels::LIGHT_LINEAR, 0),
+    Stored::new(ImageFormat::Rgba8Unorm, pixels::STORED_BYTES, pixels::LIGHT_DISPLAY, 0),
+    Stored::new(ImageFormat::Rgba8Srgb, pixels::STORED_BYTES, pixels::LIGHT_SRGB, 0),
+    Stored::new(ImageFormat::Bgra8Unorm, pixels::STORED_BYTES, pixels::LIGHT_DISPLAY, 1),
+    Stored::new(ImageFormat::Bgra8Srgb, pixels::STORED_BYTES, pixels::LIGHT_SRGB, 1),
+    Stored::new(ImageFormat::A2B10G10R10Unorm, pixels::STORED_TENS, pixels::LIGHT_DISPLAY, 0),
+    Stored::new(ImageFormat::A2R10G10B10Unorm, pixels::STORED_TENS, pixels::LIGHT_DISPLAY, 1),
+    Stored::new(ImageFormat::A2B10G10R10Unorm, pixels::STORED_TENS, pixels::LIGHT_HDR10, 0),
+    Stored::new(ImageFormat::A2R10G10B10Unorm, pixels::STORED_TENS, pixels::LIGHT_HDR10, 1),
+    Stored::new(ImageFormat::Rgba16Float, pixels::STORED_HALVES, pixels::LIGHT_DISPLAY, 0),
+];
 
 /// Planes and transmittances as an image has them.
 fn packed(
     (render, transmittances): (&[f32], &[f32]),
-    encoding: u32,
-    swaps: u32,
+    stored: Stored,
     under: Option<&[u32]>,
 ) -> Vec<u32> {
-    let words = if encoding <= pixels::PIXELS_DISPLAY_HALF { 2 * PIXELS } else { PIXELS };
-    let (mut pixels, mut depths) = (vec![0; words], vec![0.0; PIXELS]);
+    let (mut pixels, mut depths) = (vec![0; stored.words()], vec![0.0; PIXELS]);
     let params = pack_pixels::Params {
         pixel_count: PIXELS as u32,
-        encoding,
-        swaps,
+        storage: stored.storage,
+        light: stored.light,
+        swaps: stored.swaps,
         is_over: under.is_some().into(),
         exposure: 1.5,
-        background: OPTIONS.background.map(|c| encoded(encoding, c)).into(),
-        depth_plane: 0,
-        is_mean: 0,
+        nits: NITS,
+        background: OPTIONS.background.map(|c| stored.counted(c)).into(),
         has_color: 1,
+        ..pack_pixels::Params::default()
     };
     let slices = pack_pixels::Slices {
         render,
         transmittances,
         under: under.unwrap_or_default(),
+        scene: &[],
         pixels: &mut pixels,
         depths: &mut depths,
     };
@@ -171,55 +211,49 @@ fn packed(
     pixels
 }
 
-/// The largest difference of two images in levels of their format.
-fn levels(a: &[u32], b: &[u32], is_half: bool) -> u32 {
-    let of = |(&a, &b): (&u32, &u32)| match is_half {
-        true => [0, 16]
-            .map(|shift| (a >> shift & 0x7fff).abs_diff(b >> shift & 0x7fff))
-            .into_iter()
-            .max(),
-        false => {
-            a.to_le_bytes().iter().zip(b.to_le_bytes()).map(|(a, b)| u32::from(a.abs_diff(b))).max()
+/// The largest difference of two images in levels of their format; of 32-bit floats, in those of halves.
+fn levels(a: &[u32], b: &[u32], storage: u32) -> u32 {
+    let fields = |word: u32| match storage {
+        pixels::STORED_FLOATS => {
+            vec![u32::from(f16::from_f32(f32::from_bits(word)).to_bits() & 0x7fff)]
         }
+        pixels::STORED_HALVES => vec![word & 0x7fff, word >> 16 & 0x7fff],
+        pixels::STORED_SMALL_FLOATS => vec![word & 0x7ff, word >> 11 & 0x7ff, word >> 22],
+        pixels::STORED_TENS => [0, 10, 20, 30].map(|shift| word >> shift & 0x3ff).to_vec(),
+        _ => word.to_le_bytes().map(u32::from).to_vec(),
     };
     assert_eq!(a.len(), b.len());
-    a.iter().zip(b).filter_map(of).max().unwrap_or_default()
+    let [a, b] = [a, b].map(|words| words.iter().flat_map(|&word| fields(word)));
+    a.zip(b).map(|(a, b)| a.abs_diff(b)).max().unwrap_or_default()
 }
-
-fn words(format: ImageFormat) -> usize {
-    if format == ImageFormat::Rgba16Float { 2 * PIXELS } else { PIXELS }
-}
-
-const COLOR_FORMATS: [(ImageFormat, u32, u32); 5] = [
-    (ImageFormat::Rgba16Float, pixels::PIXELS_LINEAR_HALF, 0),
-    (ImageFormat::Rgba8Unorm, pixels::PIXELS_UNORM, 0),
-    (ImageFormat::Rgba8Srgb, pixels::PIXELS_SRGB, 0),
-    (ImageFormat::Bgra8Unorm, pixels::PIXELS_UNORM, 1),
-    (ImageFormat::Bgra8Srgb, pixels::PIXELS_SRGB, 1),
-];
 
 #[test]
 fn every_colour_format_gets_our_own_render_to_a_level_in_each_layer_over_what_it_has_or_not() {
     with_host(|host, gpu| {
         let mut shown = Shown::new(host, gpu);
-        let all = COLOR_FORMATS.into_iter().flat_map(|format| [(format, false), (format, true)]);
-        for (frame, ((format, encoding, swaps), is_over)) in (1..).zip(all) {
+        let all = COLOR_FORMATS.into_iter().flat_map(|stored| [(stored, false), (stored, true)]);
+        for (frame, (stored, is_over)) in (1..).zip(all) {
             let mut random = Random::new(frame);
-            let mut word = || match format {
-                ImageFormat::Rgba16Float => halves(&mut random),
-                _ => random.between(0.0, 4e9) as u32,
-            };
-            let under = [0, 1].map(|_| (0..words(format)).map(|_| word()).collect::<Vec<_>>());
-            let picture = host.picture(format, SIZE).unwrap();
+            let under = [0, 1].map(|_| stored.random(&mut random));
+            let picture = host.picture(stored.format, SIZE).unwrap();
             host.fill_picture(&picture, [&under[0], &under[1]], ImageState::SAMPLED);
             let image = picture.lent(ImageState::SAMPLED, ImageState::TRANSFER_SOURCE);
-            let color = Some(&image);
-            draw(&mut shown, frame, &Target { color, is_over, exposure: 1.5, ..Target::default() });
-            let layers = host.read_picture(&picture, words(format));
+            let target = Target {
+                color: Some(&image),
+                is_over,
+                is_display_referred: stored.light == pixels::LIGHT_DISPLAY,
+                exposure: 1.5,
+                hdr10_nits: stored.hdr10_nits(),
+                ..Target::default()
+            };
+            draw(&mut shown, frame, &target);
+            let layers = host.read_picture(&picture, stored.words());
             for ((camera, pixels), under) in cameras().iter().zip(&layers).zip(&under) {
-                let picture = expected(camera, encoding, swaps, is_over.then_some(under));
-                let off = levels(pixels, &picture, encoding == pixels::PIXELS_LINEAR_HALF);
-                assert!(off <= 1, "{format:?}: {off} levels");
+                let (render, transmittances) = planes(camera);
+                let under = is_over.then_some(&under[..]);
+                let expected = packed((&render, &transmittances), stored, under);
+                let off = levels(pixels, &expected, stored.storage);
+                assert!(off <= 1, "{stored:?}: {off} levels");
             }
             assert_ne!(layers[0], layers[1], "both layers show one view");
             host.free_picture(picture);

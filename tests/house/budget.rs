@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::fs;
 use std::path::Path;
+use std::process::Command;
 
 use crate::architecture::{ROOT, paths};
 
@@ -86,4 +87,29 @@ fn the_tree_keeps_within_its_budget_and_the_budget_close_to_the_tree() {
     }
     assert!(lines.is_empty(), "without a row in {}: {lines:?}", file!());
     assert!(broken.is_empty(), "{broken}The table of {} for this tree:\n{table}", file!());
+}
+
+/// The largest file of the repository, in bytes: what is larger is data or was built, and stays in its history for ever.
+const MAX_BYTES: u64 = 512 << 10;
+
+#[test]
+fn no_file_of_the_repository_is_data_or_was_built() {
+    let listed = ["ls-files", "-z", "--cached", "--others", "--exclude-standard"];
+    let output = Command::new("git").args(listed).current_dir(ROOT).output();
+    let Some(output) = output.ok().filter(|output| output.status.success()) else {
+        return crate::common::not_run("git", "this is no checkout, or git is not installed");
+    };
+    let names = String::from_utf8(output.stdout).unwrap();
+    let size = |name: &str| fs::metadata(Path::new(ROOT).join(name)).map_or(0, |it| it.len());
+    let large: Vec<&str> =
+        names.split_terminator('\0').filter(|name| size(name) > MAX_BYTES).collect();
+    assert!(
+        large.is_empty(),
+        "larger than {MAX_BYTES} bytes: {large:?}; ignore them, or make them smaller"
+    );
+    let built: Vec<&str> = names
+        .split_terminator('\0')
+        .filter(|name| name.split('/').any(|it| it == "target"))
+        .collect();
+    assert!(built.is_empty(), "built, and not ignored: {} files", built.len());
 }

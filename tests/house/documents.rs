@@ -9,9 +9,9 @@ use crate::architecture::{ROOT, files};
 /// The limits of documents, in bytes.
 const MAX_BYTES: [(&str, usize); 4] = [
     ("README.md", 8 << 10),
-    ("docs/guide.md", 31 << 10),
+    ("docs/guide.md", 32 << 10),
     ("docs/measurements.md", 42 << 10),
-    ("docs/embedding.md", 16 << 10),
+    ("docs/embedding.md", 18 << 10),
 ];
 
 /// Every document, with its text.
@@ -49,6 +49,20 @@ fn documents_keep_to_their_lengths() {
     for (name, limit) in MAX_BYTES {
         let bytes = fs::metadata(Path::new(ROOT).join(name)).unwrap().len();
         assert!(bytes <= limit as u64, "{name} has {bytes} bytes, and may have {limit}");
+    }
+}
+
+#[test]
+fn the_site_has_every_document() {
+    let summary = fs::read_to_string(Path::new(ROOT).join("docs/SUMMARY.md")).unwrap();
+    for (path, _) in
+        documents().into_iter().filter(|(path, _)| path.parent().unwrap().ends_with("docs"))
+    {
+        let name = path.file_name().unwrap().to_str().unwrap();
+        assert!(
+            name == "SUMMARY.md" || summary.contains(&format!("({name})")),
+            "docs/SUMMARY.md lacks {name}"
+        );
     }
 }
 

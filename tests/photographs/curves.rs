@@ -162,7 +162,7 @@ fn derivatives_agree_with_central_differences() {
                     constants[index] += shift;
                     family.shape(t, &constants)
                 };
-                close(exact, (at(h) - at(-h)) / (2.0 * h), family.constants[index].name);
+                close(exact, (at(h) - at(-h)) / (2.0 * h), &family.constants[index].name);
             }
         }
     }

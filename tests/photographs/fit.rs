@@ -45,7 +45,7 @@ fn pair(settings: &ToneSettings, dark: &Image, noise: f64, seed: u64) -> Pair {
 }
 
 fn fit_to(family: &'static Family, pairs: &[Pair], options: &FitOptions) -> CurveFit {
-    fit(family, &pairs.iter().collect::<Vec<_>>(), options).unwrap()
+    fit(&family.curve.into(), &pairs.iter().collect::<Vec<_>>(), options).unwrap()
 }
 
 /// The table's start, with every constant 6 % smaller: within the bounds, and as monotone as the start.
@@ -144,7 +144,7 @@ fn black_level_gain_and_target_mean_are_recovered_for_adaptive_curves() {
         };
         println!("{}: {:?}", family.name, found.constants);
         for constant in &found.constants {
-            let truth = expected(constant.name);
+            let truth = expected(&constant.name);
             let allowed = 5.0 * constant.standard_error.unwrap_or(0.0) + 0.03 * truth;
             let error = (constant.value - truth).abs();
             assert!(
@@ -359,7 +359,7 @@ fn degenerate_pairs_have_a_defined_result() {
         (ToneCurve::Softexp.value(1.0, 0.0, 1.0, &softexp.settings.constants) - 0.5).abs() < 0.003
     );
     assert_eq!(softexp.r_squared, None);
-    let error = fit(ToneCurve::Gamma.family(), &[&one], &PLAIN).unwrap_err();
+    let error = fit(&ToneCurve::Gamma.into(), &[&one], &PLAIN).unwrap_err();
     assert!(
         matches!(error, Error::Input { .. }) && error.to_string().contains("1 different values"),
         "{error}"
@@ -387,13 +387,13 @@ fn degenerate_pairs_have_a_defined_result() {
         FitOptions { bins: 7, ..PLAIN },
         FitOptions { bins: 70_000, ..PLAIN },
     ] {
-        let error = fit(ToneCurve::Softexp.family(), &[&one], &options).unwrap_err();
+        let error = fit(&ToneCurve::Softexp.into(), &[&one], &options).unwrap_err();
         assert_eq!(error.exit_code(), 2, "{error}");
     }
-    assert!(fit(ToneCurve::None.family(), &[&one], &PLAIN).is_err());
-    assert!(fit(ToneCurve::Softexp.family(), &[], &PLAIN).is_err());
+    assert!(fit(&ToneCurve::None.into(), &[&one], &PLAIN).is_err());
+    assert!(fit(&ToneCurve::Softexp.into(), &[], &PLAIN).is_err());
     let scene = FitScene { name: "one".to_owned(), pairs: vec![one] };
-    assert!(cross_validate(ToneCurve::Softexp.family(), &[scene], 5, &PLAIN).is_err());
+    assert!(cross_validate(&ToneCurve::Softexp.into(), &[scene], 5, &PLAIN).is_err());
 }
 
 /// AP3's formula with black level, gain and cubic free, and a prior on the published cubic with the weight of the
@@ -401,8 +401,7 @@ fn degenerate_pairs_have_a_defined_result() {
 fn assert_beats_the_published_constants(scene: FitScene) {
     let (count, scene) = (scene.pairs.len(), [scene]);
     let options = FitOptions { adapt: true, prior: count as f64, ..FitOptions::default() };
-    let held_out =
-        cross_validate(ToneCurve::FittedCubic.family(), &scene, count, &options).unwrap();
+    let held_out = cross_validate(&ToneCurve::FittedCubic.into(), &scene, count, &options).unwrap();
     assert_eq!(held_out.folds.len(), count);
     let errors = held_out.squared_error;
     assert!(
@@ -432,7 +431,7 @@ fn constants_fitted_to_real_pairs_are_better_than_the_published_ones_on_others()
     assert_eq!(scene.pairs.len(), 15);
     let pairs: Vec<&Pair> = scene.pairs.iter().collect();
     let options = FitOptions { adapt: true, ..FitOptions::default() };
-    let seen = fit(ToneCurve::FittedCubic.family(), &pairs, &options).unwrap();
+    let seen = fit(&ToneCurve::FittedCubic.into(), &pairs, &options).unwrap();
     assert!(seen.psnr.fitted > seen.psnr.ap3 + 0.3, "{:?}", seen.psnr);
     assert_beats_the_published_constants(scene);
 }

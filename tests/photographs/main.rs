@@ -9,6 +9,7 @@ mod common;
 mod curve_files;
 mod curves;
 mod exposure;
+mod expressions;
 mod fit;
 mod formats;
 mod hostile_bytes;

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::Command;
 
 use nightsplat_photographs::image::{Image, ImageFile};
-use nightsplat_photographs::metrics::{Scores, psnr, psnr_channel_mean, ssim};
+use nightsplat_photographs::metrics::{Scores, psnr, psnr_channel_mean, ssim, ssim_uniform};
 
 use crate::common::{not_run, shared};
 
@@ -26,6 +26,19 @@ fn scores_equal_those_of_a_plain_two_dimensional_convolution() {
     assert!((scores.psnr - 20.209_237_797_326_722).abs() < 1e-9, "{scores:?}");
     assert!((scores.psnr_channel_mean - 20.214_985_247_465_577).abs() < 1e-9, "{scores:?}");
     assert!((scores.ssim - 0.959_258_159_401_484).abs() < 1e-9, "{scores:?}");
+}
+
+#[test]
+fn the_uniform_window_is_that_of_scikit_image() {
+    // From `skimage.metrics.structural_similarity(render, reference, data_range=1.0, channel_axis=2)`, version 0.25, and
+    // from a direct sum over the 7x7 windows; both agree to the last digit but one.
+    let (render, reference) = pattern(13, 9);
+    let ssim = ssim_uniform(&render, &reference).unwrap();
+    assert!((ssim - 0.943_783_204_921_622_5).abs() < 1e-9, "{ssim}");
+    assert!((ssim_uniform(&render, &render).unwrap() - 1.0).abs() < 1e-12);
+    let small = Image::filled(20, 6, [0.5; 3]);
+    let problem = ssim_uniform(&small, &small).unwrap_err().to_string();
+    assert_eq!(problem, "an image of 20x6 has no window of 7x7; leave out --uniform-ssim");
 }
 
 #[test]

@@ -64,7 +64,7 @@ fn a_sweep_over_two_datasets_writes_the_table_that_papers_print() {
     let path = |name: &str| workspace.path(name).display().to_string();
     succeed(&format!("synth {} --views 9 --width 32 --height 24", path("other")));
     let sweep = format!(
-        "sweep {} {} --out {} --curves ap3,ase --steps 2 --sh-degree 0",
+        "sweep {} {} --out {} --curves ap3,ase --seeds 1,2 --steps 2 --sh-degree 0",
         path("set"),
         path("other"),
         path("sweep")
@@ -73,6 +73,21 @@ fn a_sweep_over_two_datasets_writes_the_table_that_papers_print() {
     let table = fs::read_to_string(workspace.path("sweep/scenes.md")).unwrap();
     assert!(stdout.contains("| PSNR / SSIM | set | other | mean |"), "{stdout}");
     assert_eq!(table.lines().count(), 4, "{table}");
+    // The best mean comes first, and is marked; seeds have a deviation.
+    let last = |line: &str| line.rsplit(" | ").next().unwrap().to_owned();
+    let means: Vec<String> = table.lines().skip(2).map(last).collect();
+    let number =
+        |mean: &str| mean.trim_matches(['*', ' ']).split([' ', '*']).next().unwrap().to_owned();
+    let [first, second] = [0, 1].map(|row| number(&means[row]).parse::<f64>().unwrap());
+    assert!(first >= second && means[0].starts_with("**"), "{table}");
+    assert_eq!(table.matches(" ± ").count(), 8, "{table}");
+    let page = fs::read_to_string(workspace.path("sweep/index.html")).unwrap();
+    assert!(page.contains("<h1>Sweep sweep</h1>") && page.contains("class=\"best\""), "{page}");
+    for scene in ["set", "other"] {
+        assert!(page.contains(&format!("<a href=\"{scene}/index.html\">{scene}: ")), "{page}");
+    }
+    let of_scene = fs::read_to_string(workspace.path("sweep/set/index.html")).unwrap();
+    assert!(of_scene.contains("<h1>Sweep of set</h1>"), "{of_scene}");
     let csv = fs::read_to_string(workspace.path("sweep/scenes.csv")).unwrap();
     assert_eq!(csv.lines().count(), 7, "{csv}");
     assert!(

@@ -84,7 +84,7 @@ fn a_model_in_linear_light_states_it_and_has_other_colours() {
     succeed(&export("glb", "linear.glb"));
     let text = String::from_utf8_lossy(&workspace.read("linear.glb")).into_owned();
     assert!(text.contains("lin_rec709_display"));
-    refused(&export("spz", "linear.spz"), 2, &["--linear needs floats", "ply or glb"]);
+    refused(&export("spz", "linear.spz"), 2, &["--linear needs floats", "ply, glb or usda"]);
     let of_file = format!("export {} --linear --format glb", at("linear.ply"));
     refused(&of_file, 2, &["is a model file", "pass the run directory"]);
     let (_, warned) = run(&format!("export {} --format glb", at("linear.ply")), 0);

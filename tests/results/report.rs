@@ -24,6 +24,7 @@ fn table() -> NumberTable {
             ("a|b".into(), vec![Some(25.004), None, Some(200.0)]),
             ("ap3".into(), vec![Some(25.001), Some(29.6), Some(f64::NAN)]),
         ],
+        ..NumberTable::default()
     }
 }
 
@@ -50,6 +51,20 @@ fn a_table_in_html_marks_the_same_values() {
         "{html}"
     );
     assert!(html.contains("Scores &lt;test&gt;"));
+}
+
+#[test]
+fn empty_columns_vanish_with_their_marks_and_bad_values_are_marked() {
+    let mut table = table();
+    table.rows.iter_mut().for_each(|(_, values)| values[1] = None);
+    table.bad = vec![[0, 0], [1, 1], [1, 2]];
+    let table = table.without_empty_columns();
+    let names: Vec<&str> = table.columns.iter().map(|column| column.name.as_str()).collect();
+    assert_eq!(names, ["PSNR", "steps"]);
+    assert_eq!(table.bad, [[0, 0], [1, 1]]);
+    let html = table.html();
+    assert!(html.contains("<td class=\"bad\">20.11</td>"), "{html}");
+    assert!(html.contains("<td class=\"bad\">200</td>"), "{html}");
 }
 
 #[test]
@@ -80,6 +95,7 @@ fn page(text: &str) -> String {
         title: text.into(),
         intro: vec![text.into()],
         links: vec![[text.into(), text.into()]],
+        window: Some([text.into(), text.into()]),
         facts: vec![TextTable { title: text.into(), rows: vec![[text.into(), text.into()]] }],
         tables: vec![table()],
         charts: vec![Chart::new(text, text, vec![series])],
@@ -87,6 +103,7 @@ fn page(text: &str) -> String {
             title: text.into(),
             pictures: vec![picture("20 dB"), picture("")],
         }],
+        ..Report::default()
     }
     .html()
 }

@@ -8,7 +8,7 @@ use nightsplat::results::run::{load_progress, stopped_at};
 use nightsplat_photographs::image::{Image, ImageFile};
 use serde_json::Value;
 
-use crate::common::command::{command, refused, refused_with, run, succeed};
+use crate::common::command::{command, refused, refused_with, run, succeed, unwrapped};
 use crate::common::copy;
 
 /// A folder with a small dataset in `set`.
@@ -39,13 +39,23 @@ fn without_references_test_views_are_scored_against_their_targets_with_a_label()
     succeed(&train(folder.path(), "with", "--steps 4 --curve ap3"));
     assert_eq!(json(path("with/metrics.json")).get("against"), None);
     fs::remove_dir_all(path("set/high")).unwrap();
-    for (out, curve, label) in [
-        ("tone-mapped", "--curve ap3", "against their own pseudo-GT"),
-        ("plain", "--curve none", "against the photographs themselves"),
+    for (out, curve, label, sentence) in [
+        (
+            "tone-mapped",
+            "--curve ap3",
+            "against their own pseudo-GT",
+            "2 test views match their targets, the brightened photographs, with PSNR ",
+        ),
+        (
+            "plain",
+            "--curve none",
+            "against the photographs themselves",
+            "2 test views match the photographs themselves, with PSNR ",
+        ),
     ] {
         let options = format!("--steps 4 --eval-every 2 --progress plain {curve}");
         let (message, on_the_way) = run(&train(folder.path(), out, &options), 0);
-        assert!(message.contains(label), "{message}");
+        assert!(unwrapped(&message).contains(sentence), "{message}");
         assert!(on_the_way.contains("test views against their"), "{on_the_way}");
         let metrics = json(path(out).join("metrics.json"));
         assert!(metrics["against"].as_str().unwrap().starts_with(label), "{metrics}");
@@ -99,7 +109,7 @@ fn intermediate_scores_are_rows_and_a_resumed_run_has_each_once() {
 fn a_run_prints_a_summary_at_its_start() {
     let folder = folder();
     let start = |out: &str, options: &str| succeed(&train(folder.path(), out, options));
-    let message = start("a", "--steps 1 --progress plain");
+    let message = unwrapped(&start("a", "--steps 1 --progress plain"));
     for part in [
         "8 views of 48x32 to train on",
         "2 test views (as the transforms files say) scored against reference images",
@@ -109,7 +119,7 @@ fn a_run_prints_a_summary_at_its_start() {
         assert!(message.contains(part), "no `{part}` in: {message}");
     }
     // Of eight views, one is held out; of seven, none.
-    let message = start("d", "--progress plain --preset balanced --set steps=30");
+    let message = unwrapped(&start("d", "--progress plain --preset balanced --set steps=30"));
     for part in [
         "at most 30 steps: training stops early once 1 held-out view has converged, after a cooldown of 10",
         "30 steps are too few for a cooldown of 250 (at most a third)",
@@ -117,12 +127,14 @@ fn a_run_prints_a_summary_at_its_start() {
         assert!(message.contains(part), "no `{part}` in: {message}");
     }
     assert!(message.contains("ended at step 30: all steps are done"), "{message}");
-    let message = start("e", "--progress plain --preset balanced --set steps=3 --test-every 3");
+    let message =
+        unwrapped(&start("e", "--progress plain --preset balanced --set steps=3 --test-every 3"));
     assert!(
         message.contains("no early stopping: 6 training views are too few to hold one out"),
         "{message}"
     );
-    let message = start("b", "--steps 1 --progress plain --plan none --curve AP3 --test-every 5");
+    let message =
+        unwrapped(&start("b", "--steps 1 --progress plain --plan none --curve AP3 --test-every 5"));
     assert!(message.contains("curve ap3: as requested"), "{message}");
     assert!(message.contains("2 test views (every 5th by name, as requested)"), "{message}");
     let message = start("c", "--steps 1 --progress json --curve none");

@@ -57,7 +57,10 @@ fn pages_and_event_files_show_photographs_and_renders_upright() {
     succeed(&format!("eval {root}/run --report {root}/eval.html"));
     are_upright(&folder.path().join("eval.html"));
     succeed(&format!("diagnose {root}/set --report {root}/diagnosis.html"));
-    are_upright(&folder.path().join("diagnosis.html"));
+    let diagnosis = fs::read_to_string(folder.path().join("diagnosis.html")).unwrap();
+    assert!(
+        diagnosis.contains("width=\"32\" height=\"40\"") && !diagnosis.contains("height=\"32\"")
+    );
     succeed(&format!("sweep {root}/set --out {root}/sweep --curves ase --steps 4"));
     are_upright(&folder.path().join("sweep/index.html"));
 }

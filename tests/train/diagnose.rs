@@ -12,7 +12,7 @@ use nightsplat_photographs::dataset::{Dataset, DepthOptions, LoadOptions};
 use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
 use nightsplat_synth::{Capture, Night, SyntheticOptions};
 
-use crate::common::command::{refused, run, succeed};
+use crate::common::command::{refused, run, succeed, unwrapped};
 
 const SET: SyntheticOptions = SyntheticOptions {
     views: 12,
@@ -295,9 +295,20 @@ fn the_command_prints_json_and_writes_a_page_and_a_plan_that_train_uses() {
     assert!(plan_at < html.find("<img").unwrap(), "the plan comes first");
     assert!(html.contains("Bad: below 0.02"), "a column states its unit and its bad values");
     assert!(!html.contains("http://") && !html.contains("https://"));
+    let all = succeed(&format!("diagnose {root} -v"));
+    let whole = unwrapped(&all);
+    for part in ["10 photographs to train on (96x72), 2 held out", "denoiser off", "views"] {
+        assert!(whole.contains(part), "{all}");
+    }
+    // Without -v: the verdict, what is on, and no measurement.
     let text = succeed(&format!("diagnose {root}"));
-    for part in ["10 photographs to train on (96x72), 2 held out", "denoiser", "views"] {
-        assert!(text.contains(part), "{text}");
+    assert!(text.lines().next().unwrap().contains(" set: 10 "), "{text}");
+    assert!(
+        !text.contains(" off ") && !text.contains("p90") && text.contains("\ncurve "),
+        "{text}"
+    );
+    for line in text.lines().filter(|line| !line.starts_with("next:")) {
+        assert!(line.chars().count() <= 80, "{line}");
     }
 
     // The user's change is kept, and an option overrides it.

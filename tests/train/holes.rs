@@ -15,7 +15,7 @@ use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat_synth::{Capture, Night, SyntheticOptions};
 use serde_json::Value;
 
-use crate::common::command::{self, succeed};
+use crate::common::command::{self, succeed, unwrapped};
 use crate::common::train::{advance, train};
 
 const SET: SyntheticOptions = SyntheticOptions {
@@ -192,6 +192,7 @@ fn holes_are_reported_by_train_eval_and_diagnose() {
     assert!(warning(&warned) == 1 && warned.contains("of 6 views"), "{warned}");
 
     let (message, _) = command::run(&format!("diagnose {set} --run {run}"), 0);
+    let message = unwrapped(&message);
     assert!(message.contains("note: view ") && warning(&message) == 1, "{message}");
     let json: Value =
         serde_json::from_str(&succeed(&format!("diagnose {set} --run {run} --json"))).unwrap();

@@ -9,7 +9,7 @@ use nightsplat_photographs::dataset::{Dataset, LoadOptions};
 use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
 use nightsplat_synth::{Capture, SyntheticOptions};
 
-use crate::common::command::succeed;
+use crate::common::command::{succeed, unwrapped};
 
 /// Of a room.
 fn set(lamp: Option<f64>) -> SyntheticOptions {
@@ -230,11 +230,12 @@ fn a_run_learns_the_lamp_that_was_found_and_none_where_there_is_none() {
 fn the_command_reports_the_lamp_as_text_json_and_page() {
     let folder = written(&set(Some(16.0)), &Capture::default());
     let (root, page) = (folder.path().display(), folder.path().join("page.html"));
-    let text = succeed(&format!("diagnose {root} --report {}", page.display()));
-    let line = text.lines().find(|line| line.starts_with("lamp ")).unwrap();
+    let text = succeed(&format!("diagnose {root} -v --report {}", page.display()));
     assert!(text.lines().any(|line| line.starts_with("lamp ") && line.contains(" on ")), "{text}");
+    assert!(text.lines().next().unwrap().contains("lit by a lamp"), "{text}");
+    let whole = unwrapped(&text);
     for part in ["moves with the camera", "exponent", "beyond exposures", "by distance"] {
-        assert!(line.contains(part), "{line}");
+        assert!(whole.contains(part), "{text}");
     }
     assert!(fs::read_to_string(page).unwrap().contains("moves with the camera"));
     let json: serde_json::Value =

@@ -1,4 +1,4 @@
-//! Cameras: a pinhole's numbers, also from the matrices of an engine.
+//! Cameras, also from the matrices of an engine.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use nightsplat_core::camera::{Camera, CameraModel, KannalaBrandt, deviation_from_rigid};
@@ -8,6 +8,8 @@ use super::structs::{Sized0, write};
 
 /// The lens is a fisheye (Kannala and Brandt); otherwise the camera is a pinhole.
 pub const NSP_CAMERA_FISHEYE: u32 = 1;
+/// The camera is orthographic.
+pub const NSP_CAMERA_ORTHOGRAPHIC: u32 = 2;
 
 /// A camera, in axes x right, y down, z forward.
 #[repr(C)]
@@ -19,7 +21,7 @@ pub struct NspCamera {
     pub width: u32,
     /// Height in pixels.
     pub height: u32,
-    /// Focal lengths along x and y in pixels.
+    /// Focal lengths along x and y in pixels; with `NSP_CAMERA_ORTHOGRAPHIC` pixels per world unit.
     pub focal: [f64; 2],
     /// The principal point in pixels, from the top left corner of the image.
     pub principal_point: [f64; 2],
@@ -43,13 +45,17 @@ impl NspCamera {
     /// The camera, as the library has it.
     pub fn camera(&self) -> Result<Camera, String> {
         let Self { width, height, focal, principal_point, view_from_world: m, .. } = *self;
-        if self.flags & !NSP_CAMERA_FISHEYE != 0 || self.reserved != 0 {
-            return Err("has unknown flags, or reserved is not 0".to_owned());
-        }
-        let model = match self.flags & NSP_CAMERA_FISHEYE {
+        let model = match self.flags {
             0 => CameraModel::Pinhole,
-            _ => CameraModel::Fisheye(KannalaBrandt { coefficients: self.distortion }),
+            NSP_CAMERA_FISHEYE => {
+                CameraModel::Fisheye(KannalaBrandt { coefficients: self.distortion })
+            }
+            NSP_CAMERA_ORTHOGRAPHIC => CameraModel::Orthographic,
+            _ => return Err("has unknown flags, or two that exclude each other".to_owned()),
         };
+        if self.reserved != 0 {
+            return Err("has a reserved member that is not 0".to_owned());
+        }
         let (focal, principal_point) = (DVec2::from(focal), DVec2::from(principal_point));
         Ok(Camera { width, height, focal, principal_point, model, view_from_world: affine(&m) })
     }
@@ -63,10 +69,10 @@ pub(super) fn affine(m: &[f64; 12]) -> DAffine3 {
 
 /// The camera of an engine's column-major view and projection matrices, for Vulkan's clip space (x right, y down,
 /// depth 0 to 1, or reversed). The camera may look along z or -z, with y up or down. `width` and `height` are those of
-/// the viewport in pixels.
+/// the viewport in pixels. An orthographic projection gives an orthographic camera, which looks along the axis that makes
+/// its image no mirror of the world.
 ///
-/// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared, or if the matrices scale or mirror the
-/// world.
+/// Errors: `NSP_ERROR_USAGE` if the projection is sheared, or if the matrices scale or mirror the world.
 ///
 /// # Safety
 /// `view` and `projection` are NULL or hold 16 floats; `camera` is NULL or valid, with its `struct_size`.
@@ -100,10 +106,15 @@ fn from_matrices(
         return Err(Failure::usage(format!("number {at} of view and projection is not finite")));
     }
     let p = |row: usize, column: usize| f64::from(projection[4 * column + row]);
-    let forward = p(3, 2);
-    if forward == 0.0 || p(3, 3) != 0.0 || p(3, 0) != 0.0 || p(3, 1) != 0.0 {
+    let is_orthographic = p(3, 2) == 0.0 && p(3, 3) > 0.0;
+    let forward = match is_orthographic {
+        true => p(3, 3) * axis_of_view(view, p(0, 0) * p(1, 1)),
+        false => p(3, 2),
+    };
+    if forward == 0.0 || !is_orthographic && p(3, 3) != 0.0 || p(3, 0) != 0.0 || p(3, 1) != 0.0 {
         return Err(Failure::usage(
-            "projection is not a perspective; take one whose last row is (0, 0, +-1, 0)",
+            "projection is neither perspective nor orthographic; take one whose last row is (0, 0, +-1, 0) or (0, 0, \
+             0, 1)",
         ));
     }
     let scale = DVec2::new(p(0, 0), p(1, 1)) / forward.abs();
@@ -111,7 +122,9 @@ fn from_matrices(
     if scale.min_element().abs() == 0.0 || scale.y == 0.0 {
         return Err(Failure::usage("projection has a focal length of 0"));
     }
-    let off = [p(0, 1), p(1, 0), p(0, 3), p(1, 3)];
+    // What makes no axis of the image, and where the image is shifted.
+    let (other, shift) = if is_orthographic { (2, 3) } else { (3, 2) };
+    let off = [p(0, 1), p(1, 0), p(0, other), p(1, other)];
     if off.iter().any(|x| x.abs() > slack * forward.abs()) {
         return Err(Failure::usage("projection is sheared or shifted; take one without"));
     }
@@ -119,7 +132,8 @@ fn from_matrices(
     let axes = DVec3::new(scale.x.signum(), scale.y.signum(), forward.signum());
     let v = |row: usize, column: usize| f64::from(view[4 * column + row]) * axes[row];
     let half = DVec2::new(f64::from(width), f64::from(height)) / 2.0;
-    let middle = DVec2::new(p(0, 2), p(1, 2)) / forward;
+    let middle = DVec2::new(p(0, shift), p(1, shift))
+        / if is_orthographic { forward.abs() } else { forward };
     let mut view_from_world = [0.0; 12];
     for (at, value) in view_from_world.iter_mut().enumerate() {
         *value = v(at / 4, at % 4);
@@ -132,10 +146,17 @@ fn from_matrices(
         focal: (scale.abs() * half).to_array(),
         principal_point: ((middle + 1.0) * half).to_array(),
         view_from_world,
-        flags: 0,
+        flags: if is_orthographic { NSP_CAMERA_ORTHOGRAPHIC } else { 0 },
         reserved: 0,
         distortion: [0.0; 4],
     })
+}
+
+/// The sign of z along which a view looks whose image has axes of these signs: its projection does not say.
+fn axis_of_view(view: &[f32], image: f64) -> f64 {
+    let column = |c: usize| glam::Vec3::from_slice(&view[4 * c..]).as_dvec3();
+    let rotation = DMat3::from_cols(column(0), column(1), column(2));
+    (rotation.determinant() * image).signum()
 }
 
 /// Refuses a view that mirrors or scales, with what to do about it.

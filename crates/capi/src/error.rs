@@ -41,7 +41,7 @@ pub const NSP_ERROR_VERSION: NspResult = -8;
 pub const NSP_ERROR_UNSUPPORTED: NspResult = -9;
 /// A number is NaN or infinite.
 pub const NSP_ERROR_NOT_FINITE: NspResult = -10;
-/// Training was stopped on request.
+/// The work was stopped on request.
 pub const NSP_ERROR_STOPPED: NspResult = -11;
 /// A bug in the library was caught; the object can only be destroyed.
 pub const NSP_ERROR_INTERNAL: NspResult = -127;
@@ -111,6 +111,7 @@ fn code(error: &Error) -> NspResult {
         },
         Error::DeviceLost { .. } => NSP_ERROR_LOST,
         Error::NotFinite { .. } | Error::ParameterNotFinite { .. } => NSP_ERROR_NOT_FINITE,
+        Error::Halted { .. } => NSP_ERROR_STOPPED,
         stopped if stopped.is_stop() => NSP_ERROR_STOPPED,
         Error::Vulkan { code, .. } => match vk::Result::from_raw(*code) {
             vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | vk::Result::ERROR_OUT_OF_HOST_MEMORY => {

@@ -15,7 +15,7 @@ pub const NSP_INSTANCE_HIDDEN: u32 = 1;
 /// Splats whose centres are outside of `clip_min` to `clip_max` are not drawn.
 pub const NSP_INSTANCE_CLIP: u32 = 2;
 
-/// A model in a render of several. One model can have many instances; it is uploaded once.
+/// A model in a render of several. One model can have many instances; it is uploaded once. Experimental.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspInstance {
@@ -41,12 +41,16 @@ pub struct NspInstance {
     pub flags: u32,
     /// Unused.
     pub reserved: u32,
+    /// `pose` in the frame before, for motion vectors; all zeros: as in this frame, and `scale` too.
+    pub pose_before: [f64; 12],
+    /// `scale` in the frame before; 0 stands for 1.
+    pub scale_before: f64,
 }
 
 // SAFETY: the size comes first; null pointers are zeros.
 unsafe impl Sized0 for NspInstance {
     const NAME: &'static str = "NspInstance";
-    const FIRST_SIZE: usize = size_of::<Self>();
+    const FIRST_SIZE: usize = std::mem::offset_of!(Self, pose_before);
 }
 
 /// # Safety
@@ -79,13 +83,19 @@ pub(super) unsafe fn lent_instance<'a>(
     };
     check_device(gpu, whole.gaussians)?;
     let corners = [instance.clip_min, instance.clip_max].map(DVec3::from);
-    let pose = if instance.pose == [0.0; 12] { DAffine3::IDENTITY } else { affine(&instance.pose) };
-    let scale = if instance.scale == 0.0 { 1.0 } else { instance.scale };
-    // That of a trainer takes its frame to the world first.
-    let offset = DAffine3::from_translation(scale * whole.pose.translation);
+    let placed = |pose: &[f64; 12], scale: f64| {
+        let pose = if *pose == [0.0; 12] { DAffine3::IDENTITY } else { affine(pose) };
+        let scale = if scale == 0.0 { 1.0 } else { scale };
+        // That of a trainer takes its frame to the world first.
+        let offset = DAffine3::from_translation(scale * whole.pose.translation);
+        (pose * offset, scale * whole.scale)
+    };
+    let (pose, scale) = placed(&instance.pose, instance.scale);
+    let has_moved = instance.pose_before != [0.0; 12];
     Ok(Instance {
-        pose: pose * offset,
-        scale: scale * whole.scale,
+        pose,
+        scale,
+        before: has_moved.then(|| placed(&instance.pose_before, instance.scale_before)),
         tint: if instance.tint == [0.0; 4] { [1.0; 4] } else { instance.tint },
         clip: (instance.flags & NSP_INSTANCE_CLIP != 0).then_some(corners),
         is_visible: instance.flags & NSP_INSTANCE_HIDDEN == 0,

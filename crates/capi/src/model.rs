@@ -73,7 +73,8 @@ unsafe impl Sized0 for NspModelInfo {
     const FIRST_SIZE: usize = size_of::<Self>();
 }
 
-/// Loads a model: PLY, SPZ, SOG, or a run directory. The upload is part of the next recording.
+/// Loads a model: PLY, SPZ, SOG, or a run directory. The upload is part of the next recording. Gaussians that are not
+/// finite are left out, which a warning of the log counts.
 ///
 /// # Safety
 /// `device` is NULL or valid, `path` is NULL or ends with NUL, `model` is NULL or valid.

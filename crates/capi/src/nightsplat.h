@@ -26,6 +26,9 @@
 // The lens is a fisheye (Kannala and Brandt); otherwise the camera is a pinhole.
 #define NSP_CAMERA_FISHEYE 1
 
+// The camera is orthographic.
+#define NSP_CAMERA_ORTHOGRAPHIC 2
+
 // The instance is not drawn.
 #define NSP_INSTANCE_HIDDEN 1
 
@@ -38,7 +41,7 @@
 // Writes display-referred values, as they were trained, to a float `color` image; otherwise linear light.
 #define NSP_RENDER_DISPLAY_FLOAT 2
 
-// `scene_depth` is reversed: 1 at the near plane, 0 at the far plane.
+// `scene_depth`, and `depth_out` in D32, are reversed: 1 at the near plane, 0 at the far plane.
 #define NSP_DEPTH_REVERSED 4
 
 // `scene_depth` is linear view-space depth in world units.
@@ -52,6 +55,9 @@
 // linear image, encoded values otherwise. `background` is not changed.
 #define NSP_RENDER_PHOTOGRAPH 32
 
+// `pick` is a pixel of the first camera, of which `nsp_renderer_picked` tells what is there.
+#define NSP_RENDER_PICK 64
+
 // A device. Any thread may use it.
 typedef struct NspDevice NspDevice;
 
@@ -61,8 +67,11 @@ typedef struct NspModel NspModel;
 // A renderer: compiled kernels, and memory that grows with the views. Use it from one thread at a time.
 typedef struct NspRenderer NspRenderer;
 
-// A training run. Use it from one thread at a time.
+// A training run. Use it from one thread at a time. Experimental: what begins with `nsp_trainer` may change.
 typedef struct NspTrainer NspTrainer;
+
+// Follows trainers and stops them, from any thread. Experimental.
+typedef struct NspWatch NspWatch;
 
 // 0 or more: success. Otherwise an error, whose message `nsp_last_error` returns.
 typedef int32_t NspResult;
@@ -161,7 +170,7 @@ typedef struct NspCamera {
     uint32_t width;
     // Height in pixels.
     uint32_t height;
-    // Focal lengths along x and y in pixels.
+    // Focal lengths along x and y in pixels; with `NSP_CAMERA_ORTHOGRAPHIC` pixels per world unit.
     double focal[2];
     // The principal point in pixels, from the top left corner of the image.
     double principal_point[2];
@@ -235,7 +244,7 @@ typedef struct NspImage {
     struct NspImageState after;
 } NspImage;
 
-// A model in a render of several. One model can have many instances; it is uploaded once.
+// A model in a render of several. One model can have many instances; it is uploaded once. Experimental.
 typedef struct NspInstance {
     // `sizeof(NspInstance)`; in an array, the distance between elements.
     size_t struct_size;
@@ -259,6 +268,10 @@ typedef struct NspInstance {
     uint32_t flags;
     // Unused.
     uint32_t reserved;
+    // `pose` in the frame before, for motion vectors; all zeros: as in this frame, and `scale` too.
+    double pose_before[12];
+    // `scale` in the frame before; 0 stands for 1.
+    double scale_before;
 } NspInstance;
 
 // The parameters of a render.
@@ -276,15 +289,18 @@ typedef struct NspRender {
     uint32_t camera_count;
     // `NSP_RENDER_*` and `NSP_DEPTH_*`.
     uint32_t flags;
-    // Colour with premultiplied alpha: RGBA16F (linear), or RGBA8 or BGRA8 as UNORM or SRGB; NULL: none.
+    // Colour with premultiplied alpha: RGBA16F, RGBA32F or B10G11R11 (linear), RGBA8 or BGRA8 as UNORM or SRGB,
+    // A2B10G10R10 or A2R10G10B10 (UNORM); NULL: none.
     const struct NspImage *color;
-    // View-space depth as R32F, infinite where there is no splat; NULL: none.
+    // Depth; NULL: none. As R32F: in the view, infinite where there is no splat. As D32, with or without stencil: by
+    // the projection of `scene_near`, `scene_far` and `NSP_DEPTH_REVERSED`, and at the far plane where there is no
+    // splat; it may be the image of `scene_depth`, which keeps its depth there.
     const struct NspImage *depth_out;
     // The host's depth buffer, which occludes splats: D32, D24 or D16 with or without stencil, or R32F; NULL: none.
     const struct NspImage *scene_depth;
-    // The near plane of `scene_depth` in world units.
+    // The near plane of the host's depth in world units.
     float scene_near;
-    // The far plane of `scene_depth` in world units; 0: at infinity.
+    // The far plane of the host's depth in world units; 0: at infinity.
     float scene_far;
     // The factor on linear light; 0 stands for 1.
     float exposure;
@@ -297,6 +313,19 @@ typedef struct NspRender {
     uint32_t instance_count;
     // The models that are drawn, sorted together; NULL: the model that is passed.
     const struct NspInstance *instances;
+    // `color` of ten bits is HDR10 (BT.2020, ST 2084), and linear light 1 is this many nits; 0: display-referred.
+    float hdr10_nits;
+    // With `NSP_RENDER_PICK`: column and row.
+    uint32_t pick[2];
+    // Unused.
+    uint32_t reserved;
+    // Motion vectors as RG16F or RG32F: from each pixel to where its point was in the frame before, in pixels; NULL:
+    // none. The point is at the depth in the view, infinitely far where there is no splat, and moves with the camera
+    // and with the instance (`NspInstance::pose_before`) of the splat at which half of the light is blocked.
+    const struct NspImage *motion_out;
+    // The cameras of the frame before, as many as `cameras`, of the same sizes and models; read with `motion_out`. With
+    // the principal point of this frame's, a jitter is left out.
+    const struct NspCamera *cameras_before;
 } NspRender;
 
 // The outcome of the newest frame that is done.
@@ -317,7 +346,23 @@ typedef struct NspStatus {
     uint64_t device_bytes;
 } NspStatus;
 
-// A training step.
+// What the newest pick that is done found.
+typedef struct NspPick {
+    // `sizeof(NspPick)`.
+    size_t struct_size;
+    // The number of its frame; 0: none is done yet.
+    uint64_t frame;
+    // 1: a splat blocks half of the light, with those before it; 0: none does, and the rest is 0.
+    uint32_t is_hit;
+    // The index in `NspRender::instances`; 0 where a model is drawn.
+    uint32_t instance;
+    // The index of the splat's Gaussian in its model.
+    uint32_t gaussian;
+    // Its depth in the view, world units.
+    float depth;
+} NspPick;
+
+// A training step. Experimental.
 typedef struct NspStep {
     // `sizeof(NspStep)`; of the first of an array, the distance between its elements.
     size_t struct_size;
@@ -330,6 +375,16 @@ typedef struct NspStep {
     // Unused.
     uint32_t reserved;
 } NspStep;
+
+// The mean score of the held-out views after a step. Experimental.
+typedef struct NspScore {
+    // `sizeof(NspScore)`; of the first of an array, the distance between its elements.
+    size_t struct_size;
+    // Counted from 1.
+    uint64_t step;
+    // dB, against the targets of the views.
+    double psnr;
+} NspScore;
 
 // Success.
 #define NSP_OK 0
@@ -361,7 +416,7 @@ typedef struct NspStep {
 // A number is NaN or infinite.
 #define NSP_ERROR_NOT_FINITE -10
 
-// Training was stopped on request.
+// The work was stopped on request.
 #define NSP_ERROR_STOPPED -11
 
 // A bug in the library was caught; the object can only be destroyed.
@@ -415,17 +470,18 @@ void nsp_device_destroy(struct NspDevice *device);
 
 // The camera of an engine's column-major view and projection matrices, for Vulkan's clip space (x right, y down,
 // depth 0 to 1, or reversed). The camera may look along z or -z, with y up or down. `width` and `height` are those of
-// the viewport in pixels.
+// the viewport in pixels. An orthographic projection gives an orthographic camera, which looks along the axis that makes
+// its image no mirror of the world.
 //
-// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared, or if the matrices scale or mirror the
-// world.
+// Errors: `NSP_ERROR_USAGE` if the projection is sheared, or if the matrices scale or mirror the world.
 NspResult nsp_camera_from_matrices(const float *view,
                                    const float *projection,
                                    uint32_t width,
                                    uint32_t height,
                                    struct NspCamera *camera);
 
-// Loads a model: PLY, SPZ, SOG, or a run directory. The upload is part of the next recording.
+// Loads a model: PLY, SPZ, SOG, or a run directory. The upload is part of the next recording. Gaussians that are not
+// finite are left out, which a warning of the log counts.
 NspResult nsp_model_load(struct NspDevice *device, const char *path, struct NspModel **model);
 
 // Creates a model from arrays: means (count, 3); rotations (count, 4) as w, x, y, z; natural logarithms of scales
@@ -470,24 +526,50 @@ NspResult nsp_record_render(struct NspRenderer *renderer, const struct NspModel 
 // Writes the outcome of the newest frame that is done to `status`. It never waits.
 NspResult nsp_renderer_status(const struct NspRenderer *renderer, struct NspStatus *status);
 
+// Writes what the newest pick that is done found to `pick`. It never waits.
+NspResult nsp_renderer_picked(const struct NspRenderer *renderer, struct NspPick *pick);
+
 // Destroys a renderer; frames that use it may be in flight.
 void nsp_renderer_destroy(struct NspRenderer *renderer);
 
+// Creates a watch. `progress` is called with a stage, such as "decoding photographs" or "training", how much of it is
+// done, and all of it: from any thread, by one at a time. It may call `nsp_watch_stop`, and nothing else of the library.
+// NULL: progress is not told.
+NspResult nsp_watch_create(void (*progress)(void *user, const char *stage, uint64_t done, uint64_t all),
+                           void *user,
+                           struct NspWatch **watch);
+
+// Stops the call of a trainer that is running with the watch, or the next: it returns `NSP_ERROR_STOPPED`, after a call
+// that reports the steps done so far where there are any. The trainer can go on afterwards. May be called from any
+// thread.
+NspResult nsp_watch_stop(const struct NspWatch *watch);
+
+// Destroys a watch; trainers go on without it.
+void nsp_watch_destroy(struct NspWatch *watch);
+
 // Creates a trainer for the dataset in a folder. `config_toml` is text in the format of config.toml; NULL or empty:
-// the settings follow from the photographs. The device must not be record-only.
+// the settings follow from the photographs. `watch` follows this call and the training; NULL: none. The device must not
+// be record-only.
 NspResult nsp_trainer_create(struct NspDevice *device,
                              const char *dataset,
                              const char *config_toml,
+                             const struct NspWatch *watch,
                              struct NspTrainer **trainer);
 
-// Trains for about `milliseconds`, up to step `until` at most; 0 stands for 500. Density control and the scores of
-// held-out views, where they are due, come on top. Writes the last of these steps to `steps`, at most `*count`, and
-// their number to `*count`; both may be NULL. No step: `until` is reached, or the training has ended.
+// Trains for about `milliseconds`, up to step `until` at most; 0 stands for 500. Writes the last of these steps to
+// `steps`, at most `*count`, and their number to `*count`; both may be NULL. There may be no step: held-out views are
+// scored in calls of their own, `until` is reached, or the training has ended.
 NspResult nsp_trainer_advance(struct NspTrainer *trainer,
                               uint64_t until,
                               uint32_t milliseconds,
                               struct NspStep *steps,
                               uint32_t *count);
+
+// Whether the last step is done and scored: 1; else 0.
+uint32_t nsp_trainer_has_ended(const struct NspTrainer *trainer);
+
+// Writes the last scores of the held-out views to `scores`, at most `*count`, and their number to `*count`.
+NspResult nsp_trainer_scores(const struct NspTrainer *trainer, struct NspScore *scores, uint32_t *count);
 
 // Copies the current model, on the trainer's device.
 NspResult nsp_trainer_model(struct NspTrainer *trainer, struct NspModel **model);

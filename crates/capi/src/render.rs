@@ -8,8 +8,8 @@ pub use ash::vk::{
 };
 use nightsplat::gpu::{Gpu, HostFrame, HostImage, ImageFormat, ImageState};
 use nightsplat::splats::render::{
-    DepthConvention, DepthKind, Instance, Purpose, RenderOptions, RenderSettings, Renderer,
-    SceneDepth, Target,
+    DepthConvention, DepthKind, Drawn, Hit, Instance, Motion, Pick, Purpose, RenderOptions,
+    RenderSettings, Renderer, SceneDepth, Target,
 };
 use nightsplat::splats::scene::MAX_SH_DEGREE;
 use nightsplat_core::camera::Camera;
@@ -87,7 +87,7 @@ unsafe impl Sized0 for NspImage {
 pub const NSP_RENDER_OVER: u32 = 1;
 /// Writes display-referred values, as they were trained, to a float `color` image; otherwise linear light.
 pub const NSP_RENDER_DISPLAY_FLOAT: u32 = 2;
-/// `scene_depth` is reversed: 1 at the near plane, 0 at the far plane.
+/// `scene_depth`, and `depth_out` in D32, are reversed: 1 at the near plane, 0 at the far plane.
 pub const NSP_DEPTH_REVERSED: u32 = 4;
 /// `scene_depth` is linear view-space depth in world units.
 pub const NSP_DEPTH_LINEAR: u32 = 8;
@@ -99,7 +99,11 @@ pub const NSP_DEPTH_EXPECTED: u32 = 16;
 /// linear image, encoded values otherwise. `background` is not changed.
 pub const NSP_RENDER_PHOTOGRAPH: u32 = 32;
 
+/// `pick` is a pixel of the first camera, of which `nsp_renderer_picked` tells what is there.
+pub const NSP_RENDER_PICK: u32 = 64;
+
 const FLAGS: u32 = NSP_RENDER_OVER
+    | NSP_RENDER_PICK
     | NSP_RENDER_DISPLAY_FLOAT
     | NSP_RENDER_PHOTOGRAPH
     | NSP_DEPTH_REVERSED
@@ -123,15 +127,18 @@ pub struct NspRender {
     pub camera_count: u32,
     /// `NSP_RENDER_*` and `NSP_DEPTH_*`.
     pub flags: u32,
-    /// Colour with premultiplied alpha: RGBA16F (linear), or RGBA8 or BGRA8 as UNORM or SRGB; NULL: none.
+    /// Colour with premultiplied alpha: RGBA16F, RGBA32F or B10G11R11 (linear), RGBA8 or BGRA8 as UNORM or SRGB,
+    /// A2B10G10R10 or A2R10G10B10 (UNORM); NULL: none.
     pub color: *const NspImage,
-    /// View-space depth as R32F, infinite where there is no splat; NULL: none.
+    /// Depth; NULL: none. As R32F: in the view, infinite where there is no splat. As D32, with or without stencil: by
+    /// the projection of `scene_near`, `scene_far` and `NSP_DEPTH_REVERSED`, and at the far plane where there is no
+    /// splat; it may be the image of `scene_depth`, which keeps its depth there.
     pub depth_out: *const NspImage,
     /// The host's depth buffer, which occludes splats: D32, D24 or D16 with or without stencil, or R32F; NULL: none.
     pub scene_depth: *const NspImage,
-    /// The near plane of `scene_depth` in world units.
+    /// The near plane of the host's depth in world units.
     pub scene_near: f32,
-    /// The far plane of `scene_depth` in world units; 0: at infinity.
+    /// The far plane of the host's depth in world units; 0: at infinity.
     pub scene_far: f32,
     /// The factor on linear light; 0 stands for 1.
     pub exposure: f32,
@@ -144,12 +151,25 @@ pub struct NspRender {
     pub instance_count: u32,
     /// The models that are drawn, sorted together; NULL: the model that is passed.
     pub instances: *const NspInstance,
+    /// `color` of ten bits is HDR10 (BT.2020, ST 2084), and linear light 1 is this many nits; 0: display-referred.
+    pub hdr10_nits: f32,
+    /// With `NSP_RENDER_PICK`: column and row.
+    pub pick: [u32; 2],
+    /// Unused.
+    pub reserved: u32,
+    /// Motion vectors as RG16F or RG32F: from each pixel to where its point was in the frame before, in pixels; NULL:
+    /// none. The point is at the depth in the view, infinitely far where there is no splat, and moves with the camera
+    /// and with the instance (`NspInstance::pose_before`) of the splat at which half of the light is blocked.
+    pub motion_out: *const NspImage,
+    /// The cameras of the frame before, as many as `cameras`, of the same sizes and models; read with `motion_out`. With
+    /// the principal point of this frame's, a jitter is left out.
+    pub cameras_before: *const NspCamera,
 }
 
 // SAFETY: the size comes first; null handles and pointers are zeros.
 unsafe impl Sized0 for NspRender {
     const NAME: &'static str = "NspRender";
-    const FIRST_SIZE: usize = size_of::<Self>();
+    const FIRST_SIZE: usize = std::mem::offset_of!(Self, hdr10_nits);
 }
 
 /// The outcome of the newest frame that is done.
@@ -175,6 +195,30 @@ pub struct NspStatus {
 // SAFETY: the size comes first; the rest are numbers.
 unsafe impl Sized0 for NspStatus {
     const NAME: &'static str = "NspStatus";
+    const FIRST_SIZE: usize = size_of::<Self>();
+}
+
+/// What the newest pick that is done found.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct NspPick {
+    /// `sizeof(NspPick)`.
+    pub struct_size: usize,
+    /// The number of its frame; 0: none is done yet.
+    pub frame: u64,
+    /// 1: a splat blocks half of the light, with those before it; 0: none does, and the rest is 0.
+    pub is_hit: u32,
+    /// The index in `NspRender::instances`; 0 where a model is drawn.
+    pub instance: u32,
+    /// The index of the splat's Gaussian in its model.
+    pub gaussian: u32,
+    /// Its depth in the view, world units.
+    pub depth: f32,
+}
+
+// SAFETY: the size comes first; the rest are numbers.
+unsafe impl Sized0 for NspPick {
+    const NAME: &'static str = "NspPick";
     const FIRST_SIZE: usize = size_of::<Self>();
 }
 
@@ -269,11 +313,14 @@ unsafe fn record(
         let flags = render.flags & !FLAGS;
         return Err(Failure::usage(format!("NspRender::flags has the unknown bits {flags:#x}")));
     }
+    if render.reserved != 0 {
+        return Err(Failure::usage("NspRender::reserved is not 0"));
+    }
     if render.camera_count == 0 || render.cameras.is_null() {
         return Err(Failure::usage("NspRender::cameras is NULL or empty"));
     }
     // SAFETY: as the caller promises.
-    let (color, depth, scene, cameras) = unsafe {
+    let (color, depth, scene, motion, cameras, before) = unsafe {
         let image = |image: *const NspImage, name| {
             (!image.is_null()).then(|| lent(&read(image)?, name, render.camera_count))
         };
@@ -281,7 +328,12 @@ unsafe fn record(
             image(render.color, "NspRender::color").transpose()?,
             image(render.depth_out, "NspRender::depth_out").transpose()?,
             image(render.scene_depth, "NspRender::scene_depth").transpose()?,
-            cameras(render)?,
+            image(render.motion_out, "NspRender::motion_out").transpose()?,
+            cameras(render.cameras, render.camera_count)?,
+            match render.motion_out.is_null() {
+                true => vec![],
+                false => cameras(render.cameras_before, render.camera_count)?,
+            },
         )
     };
     let has = |flag: u32| render.flags & flag != 0;
@@ -296,11 +348,18 @@ unsafe fn record(
         color: color.as_ref(),
         depth: depth.as_ref(),
         depth_kind: if has(NSP_DEPTH_EXPECTED) { DepthKind::Expected } else { DepthKind::Median },
+        depth_convention: match &depth {
+            Some(image) if image.format != ImageFormat::R32Float => convention,
+            _ => DepthConvention::Linear,
+        },
         scene: scene.as_ref().map(|image| SceneDepth { image, convention }),
         is_over: has(NSP_RENDER_OVER),
         is_display_referred: has(NSP_RENDER_DISPLAY_FLOAT),
         is_photograph: has(NSP_RENDER_PHOTOGRAPH),
         exposure: if render.exposure == 0.0 { 1.0 } else { render.exposure },
+        hdr10_nits: Some(render.hdr10_nits).filter(|&nits| nits != 0.0),
+        motion: motion.as_ref().map(|image| Motion { image, before: &before }),
+        pick: has(NSP_RENDER_PICK).then_some(render.pick),
         budget: render.budget,
     };
     let sh_degree = match models {
@@ -371,10 +430,10 @@ unsafe fn models<'a>(
 }
 
 /// # Safety
-/// `render` says the truth.
-unsafe fn cameras(render: &NspRender) -> Result<Vec<Camera>, Failure> {
+/// `from` is NULL or holds `count` cameras.
+unsafe fn cameras(from: *const NspCamera, count: u32) -> Result<Vec<Camera>, Failure> {
     // SAFETY: as the caller promises.
-    let all = unsafe { read_all(render.cameras, render.camera_count) }?;
+    let all = unsafe { read_all(from, count) }?;
     let camera = |(at, camera): (usize, &NspCamera)| {
         camera.camera().map_err(|problem| Failure::usage(format!("camera {at} {problem}")))
     };
@@ -394,8 +453,8 @@ fn lent(image: &NspImage, name: &str, cameras: u32) -> Result<HostImage, Failure
     }
     let format = ImageFormat::from_vulkan(image.format.as_raw()).ok_or_else(|| {
         Failure::usage(format!(
-            "{name} has format {:?}; take RGBA16F, RGBA8 or BGRA8 (UNORM, SRGB) for color, R32F for depth_out, \
-             D32, D24, D16 or R32F for scene_depth",
+            "{name} has format {:?}; take RGBA16F, RGBA32F, B10G11R11, RGBA8 or BGRA8 (UNORM, SRGB), A2B10G10R10 or \
+             A2R10G10B10 for color, R32F or D32 for depth_out, RG16F or RG32F for motion_out, D32, D24, D16 or R32F for scene_depth",
             image.format
         ))
     })?;
@@ -429,9 +488,7 @@ pub unsafe extern "C" fn nsp_renderer_status(
         let Shown { gpu, renderer, .. } =
             unsafe { object(renderer, "renderer")? }.0.get("the renderer")?;
         let drawn = renderer.drawn();
-        let of = |member: fn(&nightsplat::splats::render::Drawn) -> u32| {
-            drawn.as_ref().map_or(0, member)
-        };
+        let of = |member: fn(&Drawn) -> u32| drawn.as_ref().map_or(0, member);
         let filled = NspStatus {
             struct_size: size_of::<NspStatus>(),
             frame: drawn.map_or(0, |drawn| drawn.frame),
@@ -443,6 +500,34 @@ pub unsafe extern "C" fn nsp_renderer_status(
         };
         // SAFETY: as the caller promises.
         unsafe { write(status, &filled) }
+    })
+}
+
+/// Writes what the newest pick that is done found to `pick`. It never waits.
+///
+/// # Safety
+/// `renderer` and `pick` are NULL or valid.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nsp_renderer_picked(
+    renderer: *const NspRenderer,
+    pick: *mut NspPick,
+) -> NspResult {
+    guard("nsp_renderer_picked", || {
+        // SAFETY: as the caller promises.
+        let shown = unsafe { object(renderer, "renderer")? }.0.get("the renderer")?;
+        let Pick { frame, hit } = shown.renderer.picked().unwrap_or(Pick { frame: 0, hit: None });
+        let none = Hit { instance: 0, gaussian: 0, depth: 0.0 };
+        let Hit { instance, gaussian, depth } = hit.unwrap_or(none);
+        let filled = NspPick {
+            struct_size: size_of::<NspPick>(),
+            frame,
+            is_hit: hit.is_some().into(),
+            instance: instance as u32,
+            gaussian,
+            depth,
+        };
+        // SAFETY: as the caller promises.
+        unsafe { write(pick, &filled) }
     })
 }
 

@@ -23,14 +23,14 @@ pub use path::CameraPath;
 pub use poses::CameraPoses;
 pub use rigid::deviation_from_rigid;
 
-/// A pinhole or fisheye camera with its pose.
+/// A pinhole, fisheye or orthographic camera with its pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
     /// Pixels per row.
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// Focal lengths, pixels.
+    /// Focal lengths, pixels; of an orthographic camera pixels per world unit.
     pub focal: DVec2,
     /// The principal point, pixels.
     pub principal_point: DVec2,
@@ -56,6 +56,14 @@ impl Camera {
             model: CameraModel::Pinhole,
             view_from_world,
         }
+    }
+
+    /// An orthographic camera with square pixels that sees `height` world units from its upper to its lower edge, for
+    /// an image of `size` (width, height) in pixels. Axes as those of [`Camera::perspective`].
+    pub fn orthographic(view_from_world: DAffine3, height: f64, size: [u32; 2]) -> Self {
+        let focal = DVec2::splat(f64::from(size[1]) / height);
+        let model = CameraModel::Orthographic;
+        Self { focal, model, ..Self::perspective(view_from_world, 1.0, size) }
     }
 
     /// The camera's position in world space.

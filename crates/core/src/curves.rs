@@ -19,6 +19,7 @@ pub use self::curve::{
 pub use self::families::{Constant, Family, White, padded};
 pub use self::real::{Dual, LARGEST_T, Real, within};
 pub use self::scene_law::SceneLaw;
+use crate::settings::distance;
 use crate::{Error, Result};
 
 /// A curve whose values are in a file; the curves below it are the rows of [`FAMILIES`].
@@ -112,7 +113,12 @@ impl FromStr for ToneCurve {
 
     fn from_str(name: &str) -> Result<Self> {
         Family::find(name).map(|family| family.curve).ok_or_else(|| {
-            Error::Usage(format!("unknown curve `{name}`; the curves are {}", Self::names()))
+            let nearest = Self::ALL.into_iter().min_by_key(|curve| distance(name, curve.name()));
+            let nearest = nearest.map_or("", Self::name);
+            let names = Self::names();
+            Error::Usage(format!(
+                "unknown curve `{name}`; the nearest is `{nearest}`, and the curves are {names}"
+            ))
         })
     }
 }

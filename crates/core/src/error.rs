@@ -199,6 +199,13 @@ pub enum Error {
         /// What requested it.
         cause: Stop,
     },
+    /// Watched work was stopped on request ([`Watch::stop`](crate::watch::Watch::stop)), or a call that trains ends
+    /// within its time.
+    #[error("stopped on request while {stage}")]
+    Halted {
+        /// The stage of the work.
+        stage: &'static str,
+    },
     /// The result of a checked pass differs from its CPU reference.
     #[error(
         "the device disagrees with the CPU references: {what}; update the driver, or report this with the output of \
@@ -214,13 +221,19 @@ impl Error {
     /// An [`Error::Input`]. The problem may quote the file: it becomes one line of limited length.
     #[doc(hidden)]
     pub fn input(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
-        Self::Input { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
+        Self::Input {
+            path: path.as_ref().to_owned(),
+            problem: in_a_line(String::as_str(&problem.into())),
+        }
     }
 
     /// An [`Error::Output`].
     #[doc(hidden)]
     pub fn output(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
-        Self::Output { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
+        Self::Output {
+            path: path.as_ref().to_owned(),
+            problem: in_a_line(String::as_str(&problem.into())),
+        }
     }
 
     /// Whether this is no failure: somebody stopped the work, which goes on when the command is repeated.
@@ -247,6 +260,7 @@ impl Error {
             | Self::BatchStopped { cause, .. }
             | Self::StageStopped { cause, .. } => cause.exit_code(),
             Self::Output { .. }
+            | Self::Halted { .. }
             | Self::NotFinite { .. }
             | Self::ParameterNotFinite { .. }
             | Self::Disagrees { .. } => 1,
@@ -255,9 +269,9 @@ impl Error {
 }
 
 /// Escapes what [`one_line`] escapes, and truncates to a thousand characters.
-fn in_a_line(text: String) -> String {
+pub fn in_a_line(text: &str) -> String {
     const MOST: usize = 1000;
-    let line = one_line(&text);
+    let line = one_line(text);
     match line.char_indices().nth(MOST) {
         Some((end, _)) => format!("{} ...", &line[..end]),
         None => line.into_owned(),

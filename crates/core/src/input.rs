@@ -11,27 +11,43 @@ const MOST: u64 = 1 << 28;
 
 /// The bytes of a file.
 pub fn bytes(path: &Path) -> Result<Vec<u8>> {
-    let cannot = |error: std::io::Error| Error::input(path, format!("cannot be read: {error}"));
-    if path.metadata().is_ok_and(|there| there.is_file()) {
-        return std::fs::read(path).map_err(cannot);
-    }
+    bytes_if(path, |_| true)
+}
+
+/// The bytes of a file; only its beginning if `is_wanted` refuses that.
+pub fn bytes_if(path: &Path, is_wanted: impl Fn(&[u8]) -> bool) -> Result<Vec<u8>> {
+    const BEGINNING: u64 = 1 << 12;
+    // Only photographs and datasets are read within archives.
+    let is_archive = |above: &&Path| above.is_file();
+    let cannot = |error: std::io::Error| match path.ancestors().skip(1).find(is_archive) {
+        Some(archive) => {
+            Error::input(path, format!("is within {}; extract it first", archive.display()))
+        }
+        None => unreadable(path, &error),
+    };
+    let mut file = File::open(path).map_err(cannot)?;
+    let is_file = file.metadata().map_err(cannot)?.is_file();
     let mut bytes = vec![];
-    let file = File::open(path).map_err(cannot)?;
-    file.take(MOST + 1).read_to_end(&mut bytes).map_err(cannot)?;
+    file.by_ref().take(BEGINNING).read_to_end(&mut bytes).map_err(cannot)?;
+    if !is_wanted(&bytes) {
+        return Ok(bytes);
+    }
+    if is_file {
+        file.read_to_end(&mut bytes).map_err(cannot)?;
+        return Ok(bytes);
+    }
+    file.take(MOST).read_to_end(&mut bytes).map_err(cannot)?;
     if bytes.len() as u64 > MOST {
         return Err(Error::input(path, "does not end; name a file"));
     }
     Ok(bytes)
 }
 
-/// The first bytes of a file, at most `most`; `None` for what is not read twice, such as a pipe.
-pub fn start(path: &Path, most: u64) -> Option<std::io::Result<Vec<u8>>> {
-    let read = || {
-        let mut bytes = vec![];
-        File::open(path)?.take(most).read_to_end(&mut bytes)?;
-        Ok(bytes)
-    };
-    path.is_file().then(read)
+/// The error for a file or folder that cannot be read.
+pub fn unreadable(path: &Path, why: &impl std::fmt::Display) -> Error {
+    let problem =
+        format!("cannot be read: {why}; check the path and its permissions, or copy it again");
+    Error::input(path, problem)
 }
 
 /// The text of a file in UTF-8, or in UTF-16 with a byte-order mark, which is removed.
@@ -41,7 +57,8 @@ pub fn text(path: &Path) -> Result<String> {
 
 /// The text of the bytes of a file.
 pub fn decoded(path: &Path, bytes: &[u8]) -> Result<String> {
-    let cannot = |what: String| Error::input(path, format!("cannot be read: {what}"));
+    let cannot =
+        |what: String| Error::input(path, format!("cannot be read: {what}; save it as UTF-8"));
     let wide = |to_unit: fn([u8; 2]) -> u16| {
         let units: Vec<u16> =
             bytes[2..].chunks_exact(2).map(|pair| to_unit([pair[0], pair[1]])).collect();
@@ -70,6 +87,18 @@ mod tests {
         assert!(error.contains("/dev/zero: does not end"), "{error}");
         assert_eq!(bytes(Path::new("/dev/null")).unwrap(), b"");
         assert!(bytes(Path::new("/")).unwrap_err().to_string().contains("cannot be read"));
+    }
+
+    #[test]
+    fn what_is_not_wanted_is_not_read_and_a_file_within_a_file_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("scan.zip");
+        let file = File::create(&path).unwrap();
+        // More than there is memory.
+        file.set_len(1 << 43).unwrap();
+        assert!(bytes_if(&path, |start| start.starts_with(b"PK")).unwrap().len() < 1 << 16);
+        let error = bytes(&path.join("model.ply")).unwrap_err().to_string();
+        assert!(error.contains("model.ply: is within") && error.contains("extract it"), "{error}");
     }
 
     #[test]

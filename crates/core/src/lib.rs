@@ -3,6 +3,7 @@
 //!
 //! - [`error`]: errors, sorted by what the user can do about them
 //! - [`input`]: files that users name, read whole
+//! - [`natural`]: the order of names as people count
 //! - [`output`]: files that appear when complete
 //! - [`lock`]: one process at a time in a folder
 //! - [`csv`]: tables of comma-separated values
@@ -14,6 +15,7 @@
 //! - [`camera`]: cameras and lens distortion
 //! - [`image`]: images in memory
 //! - [`curves`]: the formulas of tone curves
+//! - [`watch`]: following long work, and stopping it
 
 pub mod camera;
 pub mod csv;
@@ -23,10 +25,12 @@ pub mod hash;
 pub mod image;
 pub mod input;
 pub mod lock;
+pub mod natural;
 pub mod output;
 pub mod ply;
 pub mod random;
 pub mod settings;
 pub mod table;
+pub mod watch;
 
 pub use error::{Error, Result, Stop};

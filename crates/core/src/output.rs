@@ -4,8 +4,8 @@ use std::borrow::Cow;
 use std::path::Path;
 use std::path::PathBuf;
 
-pub use crate::error::one_line;
 use crate::error::{acts, escaped};
+pub use crate::error::{in_a_line, one_line};
 use crate::{Error, Result};
 
 /// Writes a file under a temporary name and renames it when complete.
@@ -74,8 +74,9 @@ pub fn flush_to_disk(folder: &Path, files: &[&str]) -> Result<()> {
 
 /// Creates a folder unless it exists.
 pub fn create_folder(folder: &Path) -> Result<()> {
-    std::fs::create_dir_all(folder)
-        .map_err(|error| Error::output(folder, format!("cannot be created: {error}")))
+    std::fs::create_dir_all(folder).map_err(|error| {
+        Error::output(folder, format!("cannot be created ({error}); choose another place"))
+    })
 }
 
 /// Creates the folder of a file unless it exists.

@@ -215,6 +215,14 @@ pub fn row<'a>(rows: &'a [Setting], key: &str) -> Option<&'a Setting> {
     rows.iter().find(|row| row.key == key)
 }
 
+/// The Damerau-Levenshtein distance of a name to the nearest beginning of another, so that half a name is close to the
+/// whole, and to the whole.
+pub fn distance(from: &str, to: &str) -> [usize; 2] {
+    let beginnings = to.char_indices().map(|(end, _)| &to[..end]).chain([to]);
+    let distances = beginnings.map(|beginning| strsim::damerau_levenshtein(from, beginning));
+    [distances.min().unwrap_or_default(), strsim::damerau_levenshtein(from, to)]
+}
+
 /// Declares a struct of settings with its defaults, its rows and the check of its values.
 ///
 /// A field is `name: type = default => rule;`, and its documentation is its help. `default, "value in effect"` is for

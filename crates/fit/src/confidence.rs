@@ -69,7 +69,7 @@ pub(super) fn estimate(
         standard_errors[index] = Some(error).filter(|error| error.is_finite());
     }
     let estimate = |index: usize| Estimate {
-        name: model.free[index].name,
+        name: model.free[index].name.clone(),
         value: values[index],
         standard_error: standard_errors[index],
         at_bound: at_bound[index],

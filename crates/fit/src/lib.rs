@@ -25,8 +25,10 @@ mod profile;
 mod solve;
 mod validate;
 
+use std::borrow::Cow;
+
 use nightsplat_core::{Error, Result};
-use nightsplat_photographs::tone::{Family, ToneCurve, ToneSettings};
+use nightsplat_photographs::tone::{Tone, ToneCurve, ToneSettings};
 use serde::Serialize;
 
 pub use self::histogram::{Histogram, HistogramCell, HistogramColumn};
@@ -124,7 +126,7 @@ impl FitOptions {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Estimate {
     /// The constant's name.
-    pub name: &'static str,
+    pub name: Cow<'static, str>,
     /// Its value.
     pub value: f64,
     /// Its standard error; `None` at a bound, or if the pairs do not determine each constant.
@@ -133,7 +135,7 @@ pub struct Estimate {
     pub at_bound: bool,
 }
 
-/// A family fitted to pairs.
+/// A curve fitted to pairs.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CurveFit {
     /// The curve with the fitted constants, for `--curve`.
@@ -167,7 +169,7 @@ pub struct CurveFit {
 pub struct CurveScores {
     /// With the fitted constants.
     pub fitted: f64,
-    /// With the constants in the family's row.
+    /// With the curve's own constants; those of a formula without a value are 1.
     pub frozen: f64,
     /// Of AP3 with its own constants.
     pub ap3: f64,
@@ -178,7 +180,7 @@ impl CurveScores {
     fn new(settings: &ToneSettings, score: impl Fn(&ToneSettings) -> f64) -> Self {
         Self {
             fitted: score(settings),
-            frozen: score(&ToneSettings::new(settings.curve.clone())),
+            frozen: score(&model::own_settings(&settings.curve)),
             ap3: score(&ToneSettings::new(ToneCurve::Ap3)),
         }
     }
@@ -203,11 +205,11 @@ fn mean_squared_error(settings: &ToneSettings, pairs: &[&Pair]) -> f64 {
     pairs.iter().map(error).sum::<f64>() / pairs.len() as f64
 }
 
-/// Fits the family's constants to the pairs; for curves that adapt to a photograph, also black level (alpha) and gain
+/// Fits the curve's constants to the pairs; for curves that adapt to a photograph, also black level (alpha) and gain
 /// (c, g0); for those that scale by a mean, also the target mean theta.
-pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Result<CurveFit> {
+pub fn fit(curve: &Tone, pairs: &[&Pair], options: &FitOptions) -> Result<CurveFit> {
     options.check()?;
-    let model = FitModel::new(family, options)?;
+    let model = FitModel::new(curve, options)?;
     let Some(first) = pairs.first() else {
         return Err(Error::Usage("there are no pairs to fit to".to_owned()));
     };
@@ -216,9 +218,8 @@ pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Re
     let needed = model.free.len();
     if columns < needed {
         let problem = format!(
-            "all pairs together have {columns} different values of t, too few for the {needed} constants of `{}`; \
-             take photographs that are not of one colour",
-            family.name
+            "all pairs together have {columns} different values of t, too few for the {needed} constants of \
+             `{curve}`; take photographs that are not of one colour"
         );
         return Err(Error::input(&first.path, problem));
     }

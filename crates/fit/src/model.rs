@@ -1,25 +1,29 @@
-//! A family as a function of its fitted values.
+//! A curve as a function of its fitted values.
+
+use std::borrow::Cow;
 
 use nightsplat_core::{Error, Result};
 use nightsplat_photographs::tone::{
-    Constant, Curve, Dual, Family, Real, Statistics, ToneSettings, Variable, White, clamped,
+    Constant, Curve, Dual, Expression, Real, Statistics, Tone, ToneSettings, Variable, White,
+    clamped,
 };
 
 use super::{FitOptions, Pair};
 
 /// A setting that is not among a family's constants; it starts at the family's value.
 const fn setting(name: &'static str, low: f64, high: f64) -> Constant {
-    Constant { name, default: low, start: low, bounds: [low, high] }
+    Constant { name: Cow::Borrowed(name), default: low, start: low, bounds: [low, high] }
 }
 const THETA: Constant = setting("theta", 0.05, 1.0);
 const ALPHA: Constant = setting("alpha", 0.0, 0.5);
 const GAIN_C: Constant = setting("gain_c", 0.0, 20.0);
 const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
 
-/// A family with the list of its fitted values.
+/// A curve with the list of its fitted values.
 #[derive(Clone, Debug)]
 pub(super) struct FitModel {
-    pub(super) family: &'static Family,
+    /// With the curve's own constants.
+    pub(super) initial: ToneSettings,
     slots: Vec<Variable>,
     /// In the order of every vector of values.
     pub(super) free: Vec<Constant>,
@@ -56,14 +60,21 @@ impl ChannelExposure {
 }
 
 impl FitModel {
-    pub(super) fn new(family: &'static Family, options: &FitOptions) -> Result<Self> {
+    pub(super) fn new(curve: &Tone, options: &FitOptions) -> Result<Self> {
+        let initial = own_settings(curve);
+        let family = curve.family();
+        if options.adapt && family.is_none() {
+            return Err(Error::Usage(format!(
+                "`{curve}` has no black level and gain to adapt; make them constants of the formula"
+            )));
+        }
         let mut slots: Vec<Variable> =
-            (0..family.constants.len()).map(Variable::Constant).collect();
-        match family.white {
+            (0..initial.constants.len()).map(Variable::Constant).collect();
+        match initial.white() {
             White::One => {}
-            White::P90 if options.adapt || family.alpha > 0.0 || family.gain_c > 0.0 => {
+            White::P90 if options.adapt || initial.alpha > 0.0 || initial.gain_c > 0.0 => {
                 slots.extend([Variable::Alpha, Variable::GainC]);
-                if family.is_rescaled {
+                if family.is_some_and(|family| family.is_rescaled) {
                     slots.push(Variable::BaseGain);
                 }
             }
@@ -73,42 +84,42 @@ impl FitModel {
             }
         }
         if slots.is_empty() {
-            return Err(Error::Usage(format!(
-                "the curve `{}` has no constants to fit",
-                family.name
-            )));
+            return Err(Error::Usage(format!("the curve `{curve}` has no constants to fit")));
         }
-        let settings = ToneSettings::new(family.curve);
         let starting_at =
             |constant: Constant, value: f64| Constant { default: value, start: value, ..constant };
         let free = slots.iter().map(|&slot| match slot {
-            Variable::Constant(index) => family.constants[index],
-            Variable::Theta => starting_at(THETA, settings.theta),
-            Variable::Alpha => starting_at(ALPHA, settings.alpha),
-            Variable::GainC => starting_at(GAIN_C, settings.gain_c),
-            Variable::BaseGain => starting_at(BASE_GAIN, settings.base_gain),
+            Variable::Constant(index) => {
+                let constant = curve.constants()[index].clone();
+                Constant { default: initial.constants[index], ..constant }
+            }
+            Variable::Theta => starting_at(THETA, initial.theta),
+            Variable::Alpha => starting_at(ALPHA, initial.alpha),
+            Variable::GainC => starting_at(GAIN_C, initial.gain_c),
+            Variable::BaseGain => starting_at(BASE_GAIN, initial.base_gain),
         });
-        Ok(Self { free: free.collect(), family, slots })
+        Ok(Self { free: free.collect(), initial, slots })
     }
 
     /// Whether photographs with different statistics have different curves of t.
     pub(super) fn differs_by_photograph(&self) -> bool {
-        self.slots.iter().any(|slot| !matches!(slot, Variable::Constant(_)))
+        let is_shared = |slot: &Variable| matches!(slot, Variable::Constant(_));
+        self.initial.white() == White::One || !self.slots.iter().all(is_shared)
     }
 
     /// Whether the channels of a photograph have different curves.
     pub(super) fn differs_by_channel(&self) -> bool {
-        self.family.white == White::ChannelMeans
+        self.initial.white() == White::ChannelMeans
     }
 
     /// Whether the shape f has constants; otherwise the curve rises for any black level, white and gain.
     pub(super) fn has_shape(&self) -> bool {
-        !self.family.constants.is_empty()
+        !self.initial.constants.is_empty()
     }
 
     /// The curve with these values.
     pub(super) fn settings(&self, values: &[f64]) -> ToneSettings {
-        let mut settings = ToneSettings::new(self.family.curve);
+        let mut settings = self.initial.clone();
         for (&slot, &value) in self.slots.iter().zip(values) {
             match slot {
                 Variable::Constant(index) => settings.constants[index] = value,
@@ -122,15 +133,16 @@ impl FitModel {
     }
 
     /// The curve of a photograph of this exposure with these values.
-    pub(super) fn curve(&self, values: &[f64], exposure: &ChannelExposure) -> CurveOfT<f64> {
-        curve_of(&self.settings(values), exposure, |_, value| value)
+    pub(super) fn curve(&self, values: &[f64], exposure: &ChannelExposure) -> CurveOfT<'_, f64> {
+        let settings = self.settings(values);
+        CurveOfT::new(&settings, expression(&self.initial), exposure, |_, value| value)
     }
 
     /// [`Self::curve`] with its derivatives with respect to every value.
-    pub(super) fn slopes(&self, values: &[f64], exposure: &ChannelExposure) -> Slopes {
+    pub(super) fn slopes(&self, values: &[f64], exposure: &ChannelExposure) -> Slopes<'_> {
         let settings = self.settings(values);
         let by = |&variable: &Variable| {
-            curve_of(&settings, exposure, |of, value| {
+            CurveOfT::new(&settings, expression(&self.initial), exposure, |of, value| {
                 let derivative = f64::from(u8::from(of == variable));
                 Dual { value, derivative }
             })
@@ -139,27 +151,46 @@ impl FitModel {
     }
 }
 
-/// The curve of a photograph of this exposure, or of one of its channels.
-fn curve_of<T: Real>(
-    settings: &ToneSettings,
-    exposure: &ChannelExposure,
-    number: impl Fn(Variable, f64) -> T,
-) -> CurveOfT<T> {
-    let mut curve = settings.curve_of(&exposure.statistics, number);
-    if settings.white() == White::ChannelMeans {
-        curve.white = curve.constants[exposure.channel];
+/// A curve with its own constants; where a formula gives none a value, that at which a fit starts.
+pub(super) fn own_settings(curve: &Tone) -> ToneSettings {
+    let mut settings = ToneSettings::new(curve.clone());
+    for (value, constant) in settings.constants.iter_mut().zip(curve.constants()) {
+        *value = if value.is_nan() { constant.start } else { *value };
     }
-    CurveOfT { p90: exposure.p90(), curve }
+    settings
+}
+
+/// The formula of one's own, if the curve is one.
+fn expression(settings: &ToneSettings) -> Option<&Expression> {
+    match &settings.curve {
+        Tone::Expression(expression) => Some(expression),
+        _ => None,
+    }
 }
 
 /// The curve of a photograph, or of one of its channels, as a function of t = x / p90.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct CurveOfT<T> {
+pub(super) struct CurveOfT<'a, T> {
     p90: f64,
     curve: Curve<T>,
+    /// What is evaluated in place of a row of the table of curves.
+    expression: Option<&'a Expression>,
 }
 
-impl<T: Real> CurveOfT<T> {
+impl<'a, T: Real> CurveOfT<'a, T> {
+    fn new(
+        settings: &ToneSettings,
+        expression: Option<&'a Expression>,
+        exposure: &ChannelExposure,
+        number: impl Fn(Variable, f64) -> T,
+    ) -> Self {
+        let mut curve = settings.curve_of(&exposure.statistics, number);
+        if settings.white() == White::ChannelMeans {
+            curve.white = curve.constants[exposure.channel];
+        }
+        Self { p90: exposure.p90(), curve, expression }
+    }
+
     /// At t, clamped.
     pub(super) fn at(&self, t: f64) -> T {
         clamped(self.raw_at(t))
@@ -167,15 +198,19 @@ impl<T: Real> CurveOfT<T> {
 
     /// At t, unclamped.
     pub(super) fn raw_at(&self, t: f64) -> T {
-        self.curve.at(T::from_f64(t * self.p90))
+        let x = T::from_f64(t * self.p90);
+        match self.expression {
+            Some(expression) => expression.at(x / self.curve.white, &self.curve.constants),
+            None => self.curve.at(x),
+        }
     }
 }
 
 /// The derivatives of a curve with respect to every value of its model; those that are not finite count as 0.
 #[derive(Clone, Debug)]
-pub(super) struct Slopes(Vec<CurveOfT<Dual>>);
+pub(super) struct Slopes<'a>(Vec<CurveOfT<'a, Dual>>);
 
-impl Slopes {
+impl Slopes<'_> {
     /// Of the clamped curve at t.
     pub(super) fn at(&self, t: f64) -> impl Iterator<Item = f64> {
         self.0.iter().map(move |curve| counted(curve.at(t)))
@@ -196,7 +231,7 @@ pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
     let [mut count, mut squares] = [0.0; 2];
     for (channel, histogram) in pair.channels.iter().enumerate() {
         let exposure = ChannelExposure::new(pair.statistics, channel);
-        let curve = curve_of(settings, &exposure, |_, value| value);
+        let curve = CurveOfT::new(settings, expression(settings), &exposure, |_, value| value);
         squares += histogram.residuals(|x| curve.at(x / exposure.p90()))[1];
         count += histogram.count();
     }
@@ -224,7 +259,7 @@ mod tests {
             for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
                 for channel in 0..3 {
                     let exposure = ChannelExposure::new(statistics, channel);
-                    let curve = curve_of(&settings, &exposure, |_, value| value);
+                    let curve = CurveOfT::new(&settings, None, &exposure, |_, value| value);
                     let found = curve.at(x / exposure.p90());
                     let expected = if family.curve == ToneCurve::PerChannel {
                         clamped(x as f32 / parameters.constants[channel])
@@ -249,9 +284,13 @@ mod tests {
             channel_means: [0.14; 3],
         };
         let exposure = ChannelExposure::new(statistics, 1);
-        for family in FAMILIES.iter().filter(|family| family.white != White::One) {
-            let model = FitModel::new(family, &FitOptions { adapt: true, ..FitOptions::default() })
-                .unwrap();
+        let families = FAMILIES.iter().filter(|family| family.white != White::One);
+        let of_ones_own = "a*t^b/(t^b+exp(-c*t)); c = 0.3".parse().unwrap();
+        let curves = families.map(|family| Tone::Formula(family.curve)).chain([of_ones_own]);
+        for curve in curves {
+            let adapt = curve.family().is_some();
+            let options = FitOptions { adapt, ..FitOptions::default() };
+            let model = FitModel::new(&curve, &options).unwrap();
             let values: Vec<f64> = model.free.iter().map(|constant| constant.start).collect();
             for t in [0.05, 0.17, 0.61] {
                 for (index, exact) in model.slopes(&values, &exposure).raw_at(t).enumerate() {
@@ -262,12 +301,11 @@ mod tests {
                         model.curve(&values, &exposure).raw_at(t)
                     };
                     let difference = (at(h) - at(-h)) / (2.0 * h);
-                    let what = model.free[index].name;
+                    let what = &model.free[index].name;
                     let error = (exact - difference).abs();
                     assert!(
                         error < 1e-6 * (1.0 + exact.abs()),
-                        "{} by {what}: {exact}, not {difference}",
-                        family.name
+                        "{curve} by {what}: {exact}, not {difference}"
                     );
                 }
             }

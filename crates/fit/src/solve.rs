@@ -207,7 +207,7 @@ impl<'a> Solver<'a> {
     }
 
     /// The curve of every group.
-    fn curves(&self, values: &[f64]) -> Vec<CurveOfT<f64>> {
+    fn curves(&self, values: &[f64]) -> Vec<CurveOfT<'_, f64>> {
         self.groups.iter().map(|group| self.model.curve(values, &group.exposure)).collect()
     }
 
@@ -247,7 +247,7 @@ impl<'a> Solver<'a> {
     fn best_of_many_starts(&self, rows: &[FitRow]) -> Vec<f64> {
         let free = &self.model.free;
         let start: Vec<f64> = free.iter().map(|constant| constant.start).collect();
-        let stream = Stream::new(u64::from(self.model.family.curve.constant()), 0);
+        let stream = Stream::new(u64::from(self.model.initial.curve.constant()), 0);
         let jittered = |draw: usize| -> Vec<f64> {
             let value = |(index, constant)| {
                 let normal = stream.normal((draw * free.len() + index) as u64);
@@ -274,7 +274,7 @@ impl<'a> Solver<'a> {
                 LevenbergMarquardt::new().with_tol(1e-10).with_patience(PATIENCE).minimize(problem);
             tracing::trace!(
                 "{}: {:?} after {}",
-                self.model.family.name,
+                self.model.initial.curve,
                 report.termination,
                 report.number_of_evaluations
             );
@@ -416,7 +416,7 @@ impl LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_> {
             }
         };
         let of_group = |group: &Group| model.slopes(values, &group.exposure);
-        let of_groups: Vec<Slopes> = groups.iter().map(of_group).collect();
+        let of_groups: Vec<Slopes<'_>> = groups.iter().map(of_group).collect();
         for (index, row) in self.rows.iter().enumerate() {
             set(index, row.weight.sqrt(), &mut of_groups[row.group].at(row.t));
         }

@@ -1,7 +1,7 @@
 //! Scores on held-out pairs.
 
 use nightsplat_core::{Error, Result};
-use nightsplat_photographs::tone::Family;
+use nightsplat_photographs::tone::Tone;
 use serde::Serialize;
 
 use super::pairs::PairScene;
@@ -33,7 +33,7 @@ pub struct HeldOut {
 
 /// Fits to all scenes except one, for each in turn; in a single scene, to all except every `folds`-th pair.
 pub fn cross_validate(
-    family: &'static Family,
+    curve: &Tone,
     scenes: &[FitScene],
     folds: usize,
     options: &FitOptions,
@@ -42,7 +42,7 @@ pub fn cross_validate(
     let held_out = |(index, HeldOutPairs { name, pairs, .. }): (usize, &HeldOutPairs<'_, Pair>)| {
         let others = all_except(&parts, index).flat_map(|part| &part.pairs);
         let others: Vec<&Pair> = others.copied().collect();
-        let fitted = fit(family, &others, options)?;
+        let fitted = fit(curve, &others, options)?;
         Ok(Fold {
             name: name.clone(),
             pairs: pairs.len(),

@@ -25,10 +25,12 @@ mod options;
 mod original;
 mod outside;
 mod packed;
+mod pictures;
 mod pixels;
 mod ply;
 mod points;
 mod prepare;
+mod shading;
 mod similarity;
 mod source;
 mod split;
@@ -60,8 +62,10 @@ pub use masks::is_beside as is_mask;
 use members::with_held_out;
 pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
 pub use original::Original;
+pub use pictures::ViewPictures;
 pub use pixels::PhotographObserver;
 use points::points;
+pub use shading::RowBands;
 use source::ViewFiles;
 use split::{TEST_EVERY, log_split};
 pub use turns::PixelOrientation;
@@ -371,6 +375,7 @@ fn sources(
                 view_from_world: frame.view_from_world,
                 input,
                 reference,
+                target: options.targets.as_ref().and_then(|folder| frame.find(folder, files)),
                 mask: masks::find(root, frame, files),
                 depth,
                 read: [None, None],

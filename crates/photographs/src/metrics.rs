@@ -84,10 +84,29 @@ pub fn ssim(render: &Image, reference: &Image) -> Result<f64> {
     mean_ssim(render, reference, None)
 }
 
+/// Mean structural similarity with a uniform window of 7x7 and sample covariances, over the pixels whose window lies in
+/// the image and the channels: the default of scikit-image's `structural_similarity`, and the protocol of `RealX3D`.
+pub fn ssim_uniform(render: &Image, reference: &Image) -> Result<f64> {
+    if render.width.min(render.height) < UNIFORM_SIDE as u32 {
+        let (width, height) = (render.width, render.height);
+        return Err(Error::Usage(format!(
+            "an image of {width}x{height} has no window of {UNIFORM_SIDE}x{UNIFORM_SIDE}; leave out --uniform-ssim"
+        )));
+    }
+    let (pairs, width) = (channels(render, reference)?, render.width as usize);
+    let of_channel = |(a, b)| {
+        const COUNT: f64 = (UNIFORM_SIDE * UNIFORM_SIDE) as f64;
+        mean(&ssim_map(a, b, |plane| window_means(plane, width), COUNT / (COUNT - 1.0)))
+    };
+    Ok(mean(&pairs.into_par_iter().map(of_channel).collect::<Vec<f64>>()))
+}
+
 /// The mean over the channels of that over the unmasked pixels.
 fn mean_ssim(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<f64> {
     let (pairs, width) = (channels(render, reference)?, render.width as usize);
-    let ssim = pairs.into_par_iter().map(|(a, b)| mean_of_counted(&ssim_map(a, b, width), mask));
+    let ssim = pairs
+        .into_par_iter()
+        .map(|(a, b)| mean_of_counted(&ssim_map(a, b, |plane| blur(plane, width), 1.0), mask));
     Ok(mean(&ssim.collect::<Vec<f64>>()))
 }
 
@@ -139,24 +158,48 @@ fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
-/// SSIM of every pixel.
-fn ssim_map(a: &[f32], b: &[f32], width: usize) -> Vec<f64> {
+/// SSIM of every pixel, from the means over its window; `unbias` is the factor on variances and covariances.
+fn ssim_map(
+    a: &[f32],
+    b: &[f32],
+    window_means: impl Fn(&[f64]) -> Vec<f64>,
+    unbias: f64,
+) -> Vec<f64> {
     const C1: f64 = 0.01 * 0.01;
     const C2: f64 = 0.03 * 0.03;
     let blurred = |value: fn(f64, f64) -> f64| {
-        blur(&a.iter().zip(b).map(|(&a, &b)| value(a.into(), b.into())).collect::<Vec<_>>(), width)
+        window_means(&a.iter().zip(b).map(|(&a, &b)| value(a.into(), b.into())).collect::<Vec<_>>())
     };
     let (mean_a, mean_b) = (blurred(|a, _| a), blurred(|_, b| b));
     let (square_a, square_b, product) =
         (blurred(|a, _| a * a), blurred(|_, b| b * b), blurred(|a, b| a * b));
     let ssim = |i: usize| {
         let (mean_a, mean_b) = (mean_a[i], mean_b[i]);
-        let (var_a, var_b) = (square_a[i] - mean_a * mean_a, square_b[i] - mean_b * mean_b);
-        let cov = product[i] - mean_a * mean_b;
+        let variance = |square: f64, mean: f64| unbias * (square - mean * mean);
+        let (var_a, var_b) = (variance(square_a[i], mean_a), variance(square_b[i], mean_b));
+        let cov = unbias * (product[i] - mean_a * mean_b);
         let luminance = (2.0 * mean_a * mean_b + C1) / (mean_a * mean_a + mean_b * mean_b + C1);
         luminance * (2.0 * cov + C2) / (var_a + var_b + C2)
     };
-    (0..a.len()).map(ssim).collect()
+    (0..mean_a.len()).map(ssim).collect()
+}
+
+/// The side of the uniform window.
+const UNIFORM_SIDE: usize = 7;
+
+/// The mean over every uniform window that lies in a plane of rows of `width`.
+fn window_means(plane: &[f64], width: usize) -> Vec<f64> {
+    let sums = |row: &[f64]| -> Vec<f64> {
+        row.windows(UNIFORM_SIDE).map(|window| window.iter().sum()).collect()
+    };
+    let rows: Vec<Vec<f64>> = plane.chunks_exact(width).map(sums).collect();
+    let mean = |rows: &[Vec<f64>], column: usize| {
+        rows.iter().map(|row| row[column]).sum::<f64>() / (UNIFORM_SIDE * UNIFORM_SIDE) as f64
+    };
+    let columns = 0..width + 1 - UNIFORM_SIDE;
+    rows.windows(UNIFORM_SIDE)
+        .flat_map(|rows| columns.clone().map(move |column| mean(rows, column)))
+        .collect()
 }
 
 /// Taps of the window on either side of the centre.

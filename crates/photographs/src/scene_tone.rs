@@ -18,6 +18,7 @@ use crate::tone::{
     ToneSettings, all_black,
 };
 use nightsplat_core::camera::Camera;
+use nightsplat_core::watch::Stage;
 use nightsplat_core::{Error, Result};
 
 /// A curve, with what is measured of the photographs of a scene.
@@ -233,9 +234,13 @@ impl SceneTone {
 fn measured(views: &[&View], full_resolution: bool) -> Result<Vec<MeasuredPhotograph>> {
     let pixels = |view: &&View| u64::from(view.camera.width) * u64::from(view.camera.height);
     let largest = views.iter().map(pixels).max().unwrap_or_default();
+    let stage = Stage::begin("measuring photographs", views.len());
     let mut measured = vec![];
     for views in views.chunks(decoded_at_once(largest)) {
-        let of_views = views.par_iter().map(|view| measured_of(view, full_resolution));
+        let of_views = views.par_iter().map(|view| {
+            stage.next()?;
+            measured_of(view, full_resolution)
+        });
         measured.extend(of_views.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
     Ok(measured)

@@ -15,9 +15,11 @@
 //! and the black level delta0 = alpha (1 - p10 / p90)^beta is high if shadows are crushed. The statistics are those of
 //! one photograph, or means over a scene ([`Statistics`]). In the automatic curve, Y is the pixel's luminance, and the
 //! gain k follows from the luminance of all photographs ([`Exposure`]); the gain of every other curve can, too.
-//! [`FAMILIES`] is the table of all curves; a [`Table`] of values from a file and a camera [`Profile`] are curves, too.
+//! [`FAMILIES`] is the table of all curves; an [`Expression`] of one's own, a [`Table`] of values from a file and a
+//! camera [`Profile`] are curves, too.
 
 mod exposure;
+mod expression;
 mod file;
 mod histogram;
 mod inverse;
@@ -29,9 +31,10 @@ mod statistics;
 mod table;
 
 use std::fmt;
+use std::path::PathBuf;
 use std::str::FromStr;
 
-use nightsplat_core::curves::{CURVE_AUTO, CURVE_PROFILE, CURVE_TABLE, name_of};
+use nightsplat_core::curves::{CURVE_AUTO, CURVE_NONE, CURVE_PROFILE, CURVE_TABLE, name_of};
 pub use nightsplat_core::curves::{
     Constant, Constants, Curve, Dual, FAMILIES, Family, Real, SceneLaw, ToneCurve, ToneParameters,
     Variable, White, bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve,
@@ -40,6 +43,7 @@ use nightsplat_core::{Error, Result};
 
 pub use self::exposure::all_black;
 pub use self::exposure::{Exposure, exposure_knots, is_black};
+pub use self::expression::Expression;
 pub use self::file::CurveChoice;
 pub use self::histogram::EMPTY_CHANNEL;
 pub use self::histogram::LuminanceHistogram;
@@ -62,15 +66,19 @@ pub enum Tone {
     Formula(ToneCurve),
     /// The curve whose gain follows from all photographs: (1 - lambda) soft(x) + lambda x soft(Y) / Y.
     Auto,
+    /// A formula of one's own.
+    Expression(Expression),
     /// Values from a file.
     Table(Table),
     /// The colours of a camera.
     Profile(Profile),
+    /// None: the targets are pictures of another program in this folder, by the names of the photographs.
+    External(PathBuf),
 }
 
 impl Tone {
     /// The names of curves that need a file.
-    const OF_FILES: [&str; 2] = ["table", "profile"];
+    const OF_FILES: [&str; 3] = ["table", "profile", "targets"];
 
     /// The formula's row in the table.
     #[doc(hidden)]
@@ -81,9 +89,33 @@ impl Tone {
         }
     }
 
-    /// The name on the command line.
-    pub fn name(&self) -> &'static str {
-        name_of(self.constant())
+    /// The constants of its formula.
+    #[doc(hidden)]
+    pub fn constants(&self) -> &[Constant] {
+        match self {
+            Self::Formula(curve) => curve.family().constants,
+            Self::Expression(expression) => expression.constants(),
+            Self::Auto | Self::Table(_) | Self::Profile(_) | Self::External(_) => &[],
+        }
+    }
+
+    /// The formula in terms of its constants; "none" without one.
+    #[doc(hidden)]
+    pub fn formula(&self) -> &str {
+        match self {
+            Self::Formula(curve) => curve.family().formula,
+            Self::Expression(expression) => expression.formula(),
+            Self::Auto | Self::Table(_) | Self::Profile(_) | Self::External(_) => "none",
+        }
+    }
+
+    /// The name on the command line, or the formula of one's own.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Expression(expression) => expression.formula(),
+            Self::External(_) => "targets",
+            _ => name_of(self.constant()),
+        }
     }
 
     /// The number in `include/curves.glsl`: the specialization constant `TONE_CURVE`.
@@ -92,8 +124,9 @@ impl Tone {
         match self {
             Self::Formula(curve) => curve.constant(),
             Self::Auto => CURVE_AUTO,
-            Self::Table(_) => CURVE_TABLE,
+            Self::Expression(_) | Self::Table(_) => CURVE_TABLE,
             Self::Profile(_) => CURVE_PROFILE,
+            Self::External(_) => CURVE_NONE,
         }
     }
 
@@ -124,7 +157,14 @@ impl PartialEq<ToneCurve> for Tone {
 
 impl fmt::Display for Tone {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(self.name())
+        match self {
+            Self::Expression(expression) => expression.fmt(f),
+            Self::External(folder) => {
+                let name = folder.file_name().unwrap_or_default().to_string_lossy();
+                f.pad(&format!("targets of another program, {name}"))
+            }
+            _ => f.pad(self.name()),
+        }
     }
 }
 
@@ -140,7 +180,18 @@ impl FromStr for Tone {
             "profile" => Err(Error::Usage(
                 "a camera profile is named by its file: --profile FILE".to_owned(),
             )),
-            _ => name.parse().map(Self::Formula),
+            "targets" => Err(Error::Usage(
+                "targets of another program are named by their folder: --targets DIR".to_owned(),
+            )),
+            _ => name.parse().map(Self::Formula).or_else(|unknown| {
+                let expression = name.parse().map(Self::Expression);
+                expression.map_err(|wrong| if is_word(name) { unknown } else { wrong })
+            }),
         }
     }
+}
+
+/// Whether a text names a curve rather than being a formula.
+fn is_word(text: &str) -> bool {
+    text.chars().all(|c| c.is_alphanumeric() || matches!(c, '_' | '-' | '.'))
 }

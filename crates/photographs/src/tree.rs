@@ -12,13 +12,21 @@ use std::time::SystemTime;
 use nightsplat_core::{Error, Result, input};
 use zip::ZipArchive;
 
-/// The largest decompressed size of an entry, bytes.
-const MOST_OF_ENTRY: u64 = 1 << 31;
+/// Limits of an archive, bytes.
+#[derive(Clone, Copy)]
+struct Limits {
+    /// Of an entry, decompressed.
+    entry: u64,
+    /// Of all entries, decompressed.
+    all: u64,
+    /// Of the paths of all entries and their folders, which are kept in memory.
+    paths: usize,
+}
+
+const LIMITS: Limits = Limits { entry: 1 << 31, all: 1 << 37, paths: 1 << 26 };
 /// The longest name of an entry, bytes, and its most folders.
 const LONGEST_NAME: usize = 1024;
 const MOST_LEVELS: usize = 32;
-/// The largest decompressed size of all entries, bytes.
-const MOST_OF_ALL: u64 = 1 << 37;
 
 /// An open file, on disk or in memory.
 pub trait ReadSeek: Read + Seek + Send {}
@@ -72,7 +80,7 @@ pub fn open(path: &Path) -> io::Result<Box<dyn ReadSeek>> {
 
 /// The bytes of a file.
 pub fn bytes(path: &Path) -> Result<Vec<u8>> {
-    let cannot = |error: io::Error| Error::input(path, format!("cannot be read: {error}"));
+    let cannot = |error: io::Error| input::unreadable(path, &error);
     match archived(path) {
         Some((archive, entry)) => archive.read(&entry, u64::MAX).map_err(cannot),
         None => input::bytes(path),
@@ -84,11 +92,14 @@ pub fn text(path: &Path) -> Result<String> {
     input::decoded(path, &bytes(path)?)
 }
 
-/// The first bytes of a file, at most `most`; `None` for what is not read twice, such as a pipe.
-pub fn start(path: &Path, most: u64) -> Option<io::Result<Vec<u8>>> {
+/// Opens a file for its header: of an entry of an archive, its first `most` bytes; `None` for what is not read twice,
+/// such as a pipe.
+pub fn open_header(path: &Path, most: u64) -> Option<io::Result<Box<dyn ReadSeek>>> {
     match archived(path) {
-        Some((archive, entry)) => Some(archive.read(&entry, most)),
-        None => input::start(path, most),
+        Some((archive, entry)) => {
+            Some(archive.read(&entry, most).map(|start| Box::new(Cursor::new(start)) as _))
+        }
+        None => path.is_file().then(|| Ok(Box::new(File::open(path)?) as _)),
     }
 }
 
@@ -102,8 +113,7 @@ pub fn archive_of(path: &Path) -> Option<&Path> {
 
 /// Checks a path that names an archive.
 pub fn check(path: &Path) -> io::Result<()> {
-    archive_of(path)
-        .map_or(Ok(()), |path| Archive::open(path, [MOST_OF_ENTRY, MOST_OF_ALL]).map(drop))
+    archive_of(path).map_or(Ok(()), |path| Archive::open(path, LIMITS).map(drop))
 }
 
 /// Checks, before any work, that a file or a folder can be created.
@@ -133,13 +143,13 @@ struct Archive {
 }
 
 impl Archive {
-    fn open(path: &Path, [of_entry, of_all]: [u64; 2]) -> io::Result<Self> {
+    fn open(path: &Path, limits: Limits) -> io::Result<Self> {
         let file = File::open(path)?;
         let changed = file.metadata()?.modified().ok();
         let mut zip = ZipArchive::new(file).map_err(io::Error::other)?;
         let mut entries = HashMap::new();
         let mut folders = BTreeMap::from([(String::new(), BTreeSet::new())]);
-        let mut expanded = 0_u64;
+        let (mut expanded, mut paths) = (0_u64, 0);
         for index in 0..zip.len() {
             let entry = zip.by_index_raw(index).map_err(io::Error::other)?;
             let levels = entry.name_raw().iter().filter(|&&byte| byte == b'/').count();
@@ -153,23 +163,20 @@ impl Archive {
                 continue;
             };
             expanded = expanded.saturating_add(entry.size());
-            if entry.size() > of_entry || expanded > of_all {
+            if entry.size() > limits.entry || expanded > limits.all {
                 return Err(io::Error::other(format!(
                     "it expands to more than the limit for archives ({} GiB per file, {} GiB in all); extract it first",
-                    of_entry >> 30,
-                    of_all >> 30
+                    limits.entry >> 30,
+                    limits.all >> 30
                 )));
             }
             let is_folder = entry.is_dir();
-            let mut child = name.as_str();
-            while let Some((folder, name_in_folder)) =
-                child.rsplit_once('/').or(Some(("", child))).filter(|_| !child.is_empty())
-            {
-                folders
-                    .entry(folder.to_owned())
-                    .or_insert_with(BTreeSet::new)
-                    .insert(name_in_folder.to_owned());
-                child = folder;
+            paths += enter(&mut folders, &name);
+            if paths > limits.paths {
+                return Err(io::Error::other(format!(
+                    "the paths in it take more than {} MiB of memory; extract it first",
+                    limits.paths >> 20
+                )));
             }
             if is_folder {
                 folders.entry(name).or_default();
@@ -190,6 +197,22 @@ impl Archive {
         entry.take(length.min(most)).read_to_end(&mut bytes)?;
         Ok(bytes)
     }
+}
+
+/// Enters a path into its folders; returns about how many bytes that takes.
+fn enter(folders: &mut BTreeMap<String, BTreeSet<String>>, path: &str) -> usize {
+    /// Of a string in a tree, besides its characters.
+    const STRING: usize = 64;
+    let (mut child, mut taken) = (path, STRING + path.len());
+    while !child.is_empty() {
+        let (folder, name) = child.rsplit_once('/').unwrap_or(("", child));
+        if !folders.entry(folder.to_owned()).or_default().insert(name.to_owned()) {
+            break;
+        }
+        taken += 2 * STRING + folder.len() + name.len();
+        child = folder;
+    }
+    taken
 }
 
 /// A path within an archive with slashes; `None` if it leads out.
@@ -216,7 +239,7 @@ fn archived(path: &Path) -> Option<(Arc<Archive>, String)> {
     if let Some(archive) = opened.get(at).filter(|archive| archive.changed == changed) {
         return Some((archive.clone(), entry));
     }
-    let archive = Arc::new(Archive::open(at, [MOST_OF_ENTRY, MOST_OF_ALL]).ok()?);
+    let archive = Arc::new(Archive::open(at, LIMITS).ok()?);
     opened.insert(at.to_owned(), archive.clone());
     Some((archive, entry))
 }
@@ -274,8 +297,9 @@ mod tests {
     fn an_archive_that_declares_too_large_a_size_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let zip = archive(folder.path(), &[("a", &[0; 60_000]), ("b", &[0; 60_000])]);
-        assert!(Archive::open(&zip, [60_000, 120_000]).is_ok());
-        for limits in [[59_999, 1 << 20], [60_000, 119_999]] {
+        let limits = |entry, all| Limits { entry, all, ..LIMITS };
+        assert!(Archive::open(&zip, limits(60_000, 120_000)).is_ok());
+        for limits in [limits(59_999, 1 << 20), limits(60_000, 119_999)] {
             let error = Archive::open(&zip, limits).err().unwrap().to_string();
             assert!(error.contains("extract it first"), "{error}");
         }
@@ -291,6 +315,22 @@ mod tests {
             let error = check(&zip).unwrap_err().to_string();
             assert!(error.contains("more than 1024 bytes or 32 folders"), "{error}");
         }
+    }
+
+    #[test]
+    fn an_archive_whose_paths_take_much_memory_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let deep = |at: usize| format!("{at}/{}x", "folder/".repeat(30));
+        let names: Vec<String> = (0..9).map(deep).collect();
+        let files: Vec<(&str, &[u8])> =
+            names.iter().map(|name| (name.as_str(), &b""[..])).collect();
+        let zip = archive(folder.path(), &files);
+        check(&zip).unwrap();
+        let limits = Limits { paths: 1 << 15, ..LIMITS };
+        let error = Archive::open(&zip, limits).err().unwrap().to_string();
+        assert!(error.contains("paths in it take more than"), "{error}");
+        archive(folder.path(), &files[..1]);
+        assert!(Archive::open(&zip, limits).is_ok());
     }
 
     #[test]

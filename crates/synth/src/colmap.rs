@@ -59,10 +59,10 @@ pub(super) fn model(
     let points = sparse_points(scene, cameras, draws, seed);
     let Camera { width, height, focal, principal_point, model, .. } = cameras[0];
     let (name, distortion) = match model {
-        CameraModel::Pinhole => ("PINHOLE", String::new()),
         CameraModel::Fisheye(lens) => {
             ("OPENCV_FISHEYE", lens.coefficients.map(|k| format!(" {k}")).concat())
         }
+        _ => ("PINHOLE", String::new()),
     };
     let camera_list = format!(
         "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {name} {width} {height} {} {} {} {}{distortion}\n",

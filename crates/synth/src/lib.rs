@@ -16,6 +16,7 @@ use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use nightsplat_core::camera::{Camera, CameraModel, KannalaBrandt};
+use nightsplat_core::output::create_folder;
 use nightsplat_core::{Error, Result};
 use nightsplat_photographs::image::{Image, ImageFile, srgb_from_linear};
 use rayon::prelude::*;
@@ -182,8 +183,7 @@ pub fn write_captured(
     let (low, high, sparse) = (dir.join("low"), dir.join("high"), dir.join("colmap_sparse/0"));
     let lit = options.lamp.map(|_| dir.join("lit"));
     for folder in [&low, &high, &sparse].into_iter().chain(&lit) {
-        fs::create_dir_all(folder)
-            .map_err(|error| Error::output(folder, format!("cannot be made: {error}")))?;
+        create_folder(folder)?;
     }
     // The lists of frames make the dataset look complete, so those of an earlier dataset are removed first, and new
     // ones are written last.

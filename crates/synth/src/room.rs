@@ -11,7 +11,7 @@ use super::Scene;
 use super::lamp;
 use super::night::ViewLights;
 use super::shapes::{
-    Hit, SceneSurface, SurfaceShape, TextureNoise, nearest, open_beside, smoothstep,
+    RayHit, SceneSurface, SurfaceShape, TextureNoise, nearest, open_beside, smoothstep,
 };
 
 /// The look of a surface.
@@ -83,8 +83,8 @@ impl Room {
         &self,
         origin: DVec3,
         direction: DVec3,
-    ) -> Option<(&SceneSurface<RoomMaterial>, Hit)> {
-        let height = |hit: &Hit| origin.z + hit.distance * direction.z;
+    ) -> Option<(&SceneSurface<RoomMaterial>, RayHit)> {
+        let height = |hit: &RayHit| origin.z + hit.distance * direction.z;
         nearest(self.surfaces.iter(), origin, direction)
             .filter(|(_, hit)| !self.is_open || height(hit) < WALL || hit.normal.z > 0.0)
     }

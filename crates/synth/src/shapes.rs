@@ -20,7 +20,7 @@ pub(super) struct SceneSurface<L> {
 }
 
 /// The intersection of a ray and a surface.
-pub(super) struct Hit {
+pub(super) struct RayHit {
     pub(super) distance: f64,
     pub(super) normal: DVec3,
     /// The position at which the albedo is evaluated.
@@ -32,7 +32,7 @@ pub(super) fn nearest<'a, L>(
     surfaces: impl Iterator<Item = &'a SceneSurface<L>>,
     origin: DVec3,
     direction: DVec3,
-) -> Option<(&'a SceneSurface<L>, Hit)> {
+) -> Option<(&'a SceneSurface<L>, RayHit)> {
     let hits =
         surfaces.filter_map(|surface| Some((surface, surface.shape.hit(origin, direction)?)));
     hits.min_by(|(_, a), (_, b)| a.distance.total_cmp(&b.distance))
@@ -40,13 +40,13 @@ pub(super) fn nearest<'a, L>(
 
 impl SurfaceShape {
     /// The first point of a ray on the shape's outside, if any.
-    pub(super) fn hit(&self, origin: DVec3, direction: DVec3) -> Option<Hit> {
+    pub(super) fn hit(&self, origin: DVec3, direction: DVec3) -> Option<RayHit> {
         match *self {
             Self::Plane { normal, offset } => {
                 let speed = direction.dot(normal);
                 let distance = (offset - origin.dot(normal)) / speed;
                 let position = origin + distance * direction;
-                (speed < 0.0 && distance > 0.0).then_some(Hit { distance, normal, position })
+                (speed < 0.0 && distance > 0.0).then_some(RayHit { distance, normal, position })
             }
             Self::Sphere { center, radius } => {
                 let from_center = origin - center;
@@ -55,7 +55,7 @@ impl SurfaceShape {
                 let distance = -half_b - root.sqrt();
                 let normal = (from_center + distance * direction) / radius;
                 // A negative root makes the distance NaN, which is not greater than zero either.
-                (distance > 0.0).then_some(Hit { distance, normal, position: normal })
+                (distance > 0.0).then_some(RayHit { distance, normal, position: normal })
             }
             Self::Block { center, half, turn } => {
                 let (origin, direction) = (turn * (origin - center), turn * direction);
@@ -65,7 +65,7 @@ impl SurfaceShape {
                 let axis = [DVec3::X, DVec3::Y, DVec3::Z][enter.max_position()];
                 let normal = turn.transpose() * (-axis * direction.dot(axis).signum());
                 let position = origin + distance * direction;
-                (distance > 0.0 && distance < exit.min_element()).then_some(Hit {
+                (distance > 0.0 && distance < exit.min_element()).then_some(RayHit {
                     distance,
                     normal,
                     position,

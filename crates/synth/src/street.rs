@@ -10,7 +10,7 @@ use super::Scene;
 use super::lamp;
 use super::night::ViewLights;
 use super::shapes::{
-    Hit, SceneSurface, SurfaceShape, TextureNoise, nearest, open_beside, smoothstep,
+    RayHit, SceneSurface, SurfaceShape, TextureNoise, nearest, open_beside, smoothstep,
 };
 
 /// How much darker the last plot's light is than the first one's, on the photographs.
@@ -81,7 +81,7 @@ impl Street {
         &self,
         origin: DVec3,
         direction: DVec3,
-    ) -> Option<(&SceneSurface<StreetMaterial>, Hit)> {
+    ) -> Option<(&SceneSurface<StreetMaterial>, RayHit)> {
         let at = |height: f64| ((height - origin.z) / direction.z).clamp(0.0, REACH);
         let along = [at(0.0), at(TOP)].map(|distance| origin.x + distance * direction.x);
         let plot = |x: f64| (x + BEYOND as f64).max(0.0) as usize;

@@ -10,11 +10,10 @@
 
 use std::collections::HashMap;
 use std::fmt::Write as _;
-use std::fs;
 use std::path::Path;
 
 use nightsplat_core::camera::{Camera, CameraModel};
-use nightsplat_core::output::write_whole;
+use nightsplat_core::output::{create_folder, write_whole};
 use nightsplat_core::random::Stream;
 use nightsplat_core::{Error, Result, csv};
 use nightsplat_photographs::dataset::{Dataset, Split, View};
@@ -96,8 +95,7 @@ pub fn write(dir: &Path, dataset: &Dataset, variation: &Variation) -> Result<usi
     }
     let sparse = dir.join("sparse/0");
     for folder in [&dir.join(VARIED), &dir.join(CLEAN), &sparse] {
-        fs::create_dir_all(folder)
-            .map_err(|error| Error::output(folder, format!("cannot be made ({error})")))?;
+        create_folder(folder)?;
     }
     let (mut table, mut tests) = ("name,stops,gamma\n".to_owned(), String::new());
     let mut luminances = vec![];

@@ -6,7 +6,8 @@
 //! Depth limits: converts a host's depth image to the depths in the view beyond which everything is hidden.
 //!
 //! With e = d where depth is reversed and 1 - d else: z = near far / (near + e (far - near)), and z = near / e before
-//! an infinite far plane. At e = 0 the host drew nothing, and nothing is hidden.
+//! an infinite far plane. An orthographic camera has z = far - e (far - near). At e = 0 the host drew nothing, and
+//! nothing is hidden.
 
 layout(local_size_x = 64) in;
 
@@ -15,6 +16,7 @@ layout(push_constant, scalar) uniform Params {
     uint  format;       // DEPTH_*
     uint  is_reversed;
     uint  is_linear;    // 1: the values are depths in the view
+    uint  is_orthographic;
     float near;         // world units
     float far;          // 0: infinite
 };
@@ -40,6 +42,7 @@ void main() {
     }
     float e = is_reversed != 0 ? depth : 1.0 - depth;
     float z = far > 0.0 ? near * far / (near + e * (far - near)) : near / e;
+    if (is_orthographic != 0) z = far - e * (far - near);
     // Positive phrasing: a NaN hides nothing.
     limits[at] = e > 0.0 ? z : NO_DEPTH;
 }

@@ -156,6 +156,7 @@ void main() {
     vec3 center = -transpose(mat3(view)) * view[3];
     if (INSTANCES) center = instances[instance].camera_center;
     vec3 offset = mean - center;
+    if (IS_ORTHOGRAPHIC) offset = transpose(mat3(view))[2];
     vec3 rgb = sh_color(i, normalize(offset * finite_scale(length(offset))));
     if (LAMP) {
         Lamp loaded = load_lamp();

@@ -24,7 +24,7 @@ const ROWS: [Row; 10] = [
         "crop",
         "REGION",
         "Keep the Gaussians in a box X0,Y0,Z0,X1,Y1,Z1, in a sphere X,Y,Z,R, or, for cameras, in the sphere around \
-         what the cameras look at that contains them",
+         what the cameras look at that contains them, and those outside that training views show",
         crop,
     ),
     ("opacity-min", "O", "Remove Gaussians of a lower opacity, 0 to 1", |text| {
@@ -80,7 +80,7 @@ const ROWS: [Row; 10] = [
 
 const FLOATERS: &str = "floaters";
 const FLOATERS_HELP: &str = "Remove the Gaussians that the training views contradict, and those that float unseen; \
-                             says how many, and the held-out PSNR before and after";
+                             says how many";
 
 impl Operations {
     pub(super) fn is_empty(&self) -> bool {

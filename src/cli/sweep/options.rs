@@ -14,7 +14,7 @@ use crate::cli::train::TrainOptions;
 /// Options of `train` that take a list here: name in `train`, name here, help.
 const LISTS: [(&str, &str, &str); 5] = [
     ("preset", "presets", "Presets, each with its plan for the photographs"),
-    ("curve", "curves", "Tone curves by name or file, or all [default: {tone.curve}]"),
+    ("curve", "curves", "Tone curves by name, formula or file, or all [default: {tone.curve}]"),
     ("gain", "gain", "Values of the gain constant c, or auto"),
     ("theta", "theta", "Target means of the curve linear"),
     ("seed", "seeds", "Seeds to average over"),

@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! OUT/SCENE/          the sweep of a dataset
-//!     scenes.md       a row per point, a column per dataset and their mean: PSNR / SSIM / LPIPS
+//!     index.html      all datasets: a link to the page of each, the table, a bar per point
+//!     scenes.md       a row per point, the best mean first, a column per dataset and their mean: PSNR / SSIM / LPIPS
 //!     scenes.csv      a row per point and dataset, with every digit
 //!     scenes.tex      the rows of scenes.md for LaTeX
 //! ```
@@ -35,10 +36,11 @@ pub(super) fn run(args: &SweepArgs) -> Result<()> {
             dataset: dataset.clone(),
             more: vec![],
             out: args.out.join(&name),
+            renders: args.renders.iter().map(|renders| renders.of_scene(&name)).collect(),
             ..args.clone()
         };
-        let title = format!("Sweep of {}", dataset.display());
-        let Some((rows, failures)) = super::swept(&args_of_scene, &title, &[], &[])? else {
+        let title = format!("Sweep of {name}");
+        let Some((rows, failures)) = super::swept(&args_of_scene, &title, &[], None)? else {
             continue;
         };
         failed.extend(failures.into_iter().map(|failure| (name.clone(), failure)));
@@ -53,8 +55,8 @@ pub(super) fn run(args: &SweepArgs) -> Result<()> {
         tell(printable(&table.markdown()).into_owned() + "\n");
         let out = args.out.display();
         finish(
-            &format!("{out}/scenes.md, {out}/scenes.csv, {out}/scenes.tex"),
-            &format!("open {out}/scenes.md"),
+            &format!("{out}/index.html, {out}/scenes.md, {out}/scenes.csv, {out}/scenes.tex"),
+            &format!("open {out}/index.html"),
         );
     }
     match failed.first() {

@@ -7,15 +7,14 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::output::{create_folder, one_line};
-use nightsplat_core::table::aligned;
 use nightsplat_photographs::dataset::{Dataset, Split};
 use nightsplat_photographs::findings::findings;
 use nightsplat_photographs::image::{ColourCounts, Image, Mask, Orientation, PictureFile};
 use nightsplat_photographs::metrics::Scores;
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{
-    CurveChoice, Exposure, MeasuredPhotograph, NEAR_WHITE, Statistics, Tone, ToneCurve,
-    ToneSettings, all_black,
+    CurveChoice, Exposure, MeasuredPhotograph, NEAR_WHITE, Statistics, Tone, ToneSettings,
+    all_black,
 };
 use nightsplat_photographs::tree::check_writable;
 use serde::Serialize;
@@ -23,7 +22,8 @@ use serde::Serialize;
 use self::page::TonePage;
 use self::photographs::{InputPhotograph, listed};
 use crate::cli::settings::{CurveOptions, Selection, SettingOptions};
-use crate::cli::{OutputFormat, finish, print, progress_bar, word, words};
+use crate::cli::tell::wrapped;
+use crate::cli::{OutputFormat, finish, print, progress_bar, quoted, word, words};
 use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
@@ -54,7 +54,7 @@ pub struct ApplyArgs {
     /// Print JSON instead of a table
     #[arg(long)]
     pub json: bool,
-    /// Write a page with measurements, histograms and images
+    /// Write a page with all photographs, dark and lit, measurements and histograms
     #[arg(long, value_name = "FILE.html")]
     pub report: Option<PathBuf>,
     /// More curves for the page
@@ -128,8 +128,9 @@ pub struct ToneReport {
     /// The photograph.
     #[serde(flatten)]
     pub before: Measures,
-    /// Black level by the curve's alpha and beta, or by the paper's alpha if the curve has none.
-    pub delta0: f64,
+    /// Black level by the alpha and beta of the curve, if it has one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub delta0: Option<f64>,
     /// Pixels that are masked, or not finite and thus black in the result; no statistic includes them.
     pub unusable_pixels: usize,
     /// The result.
@@ -199,7 +200,7 @@ pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
     if args.json {
         return Ok(print(serde_json::to_string_pretty(&output)?)?);
     }
-    print(text_table(&output))?;
+    print(text(&output))?;
     let images =
         args.out.as_ref().map(|out| format!("{} images to {}", output.views.len(), out.display()));
     let wrote: Vec<String> = images
@@ -208,7 +209,8 @@ pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
         .collect();
     let next = match Dataset::is_at(&args.input) {
         true => {
-            format!("nightsplat train {} --out run --curve {}", word(&args.input), args.tone.name())
+            let curve = quoted(&args.tone.name());
+            format!("nightsplat train {} --out run --curve {curve}", word(&args.input))
         }
         false => format!("nightsplat pose {} --out scene", word(&args.input)),
     };
@@ -216,36 +218,16 @@ pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn text_table(output: &ToneOutput) -> String {
-    let heading = "name p10 p90 r delta0 Y skewness -> Y skewness near_white PSNR SSIM";
-    let mut rows = vec![heading.split(' ').map(|name| name.replace('_', " ")).collect::<Vec<_>>()];
-    let views = output.views.iter().map(|(name, report)| (name.as_str(), report));
-    for (name, report) in views.chain([("scene", &output.scene)]) {
-        let ToneReport { before, delta0, after, scores, .. } = report;
-        let score =
-            |value: fn(&Scores) -> String| scores.as_ref().map_or_else(|| "-".to_owned(), value);
-        rows.push(vec![
-            name.to_owned(),
-            format!("{:.4}", before.p10),
-            format!("{:.4}", before.p90),
-            format!("{:.3}", before.r),
-            format!("{delta0:.4}"),
-            format!("{:.4}", before.mean_luminance),
-            format!("{:.2}", before.skewness),
-            String::new(),
-            format!("{:.4}", after.mean_luminance),
-            format!("{:.2}", after.skewness),
-            format!("{:.1} %", 100.0 * after.near_white_fraction),
-            score(|scores| format!("{:.2}", scores.psnr)),
-            score(|scores| format!("{:.3}", scores.ssim)),
-        ]);
-    }
-    let remarks: String =
-        output.remarks.iter().map(|remark| format!("note: {}\n", one_line(remark))).collect();
-    let reason = output.exposure.as_ref().map(|exposure| format!("{}\n", exposure.reason()));
+fn text(output: &ToneOutput) -> String {
+    let remarks: String = output
+        .remarks
+        .iter()
+        .map(|remark| wrapped(&format!("note: {}", one_line(remark)), 6))
+        .collect();
+    let reason = output.exposure.as_ref().map(|exposure| wrapped(&exposure.reason(), 0));
     let label = output.with_reference.as_deref().map(eval::with_reference);
     let label = label.map(|line| line + "\n").unwrap_or_default();
-    reason.unwrap_or_default() + &aligned(&rows) + &remarks + &label
+    reason.unwrap_or_default() + &page::table(output).text() + &remarks + &label
 }
 
 /// Maps every photograph and writes it to `args.out` under its own name. Of several photographs, unusable ones are
@@ -297,7 +279,8 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     scene.gain = exposure.as_ref().map(|exposure| exposure.gain);
     let with_reference = settings.knows_references();
     let near_white = scene.after.near_white_fraction - scene.before.near_white_fraction;
-    let mut remarks = findings(&set.measured, exposure.as_ref(), near_white);
+    let measured: Vec<MeasuredPhotograph> = set.measured.into_values().collect();
+    let mut remarks = findings(&measured, exposure.as_ref(), near_white);
     if Dataset::is_at(&args.input) {
         remarks.extend(remarks_at_points(&TrainConfig { dataset: args.input.clone(), ..config }));
     }
@@ -315,8 +298,8 @@ struct CurveOnSet {
     inverted: bool,
     /// Counts of converted and unsupported colours, of photographs and of references.
     colours: [ColourCounts; 2],
-    /// Those that are not for tests, as they were mapped.
-    measured: Vec<MeasuredPhotograph>,
+    /// Those that are not for tests, by file: all where the curve depends on the whole set, else as they are mapped.
+    measured: BTreeMap<PathBuf, MeasuredPhotograph>,
 }
 
 impl CurveOnSet {
@@ -328,13 +311,14 @@ impl CurveOnSet {
         (input, inverted): (&Path, bool),
     ) -> Result<Self> {
         let levels = photographs.first().map(|listed| listed.levels).unwrap_or_default();
-        let mut measured = vec![];
+        let mut measured = BTreeMap::new();
         if settings.scene_statistics || settings.takes_exposure() {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
                 // Unusable photographs are reported when they are mapped.
                 let unsaid = ColourCounts::of_levels(levels);
                 let Ok((photograph, gaps)) = loaded(listed, inverted, &unsaid) else { continue };
-                measured.push(MeasuredPhotograph::measure(&without(&photograph, &gaps)));
+                let one = MeasuredPhotograph::measure(&without(&photograph, &gaps));
+                measured.insert(listed.input.clone(), one);
             }
             if measured.is_empty() && settings.scene_statistics {
                 let problem =
@@ -342,16 +326,17 @@ impl CurveOnSet {
                 return Err(Error::Usage(problem.to_owned()));
             }
         }
-        let scene = match SceneTone::from_photographs(&settings, &measured) {
+        let photographs: Vec<MeasuredPhotograph> = measured.values().cloned().collect();
+        let scene = match SceneTone::from_photographs(&settings, &photographs) {
             Some(scene) => scene,
-            None if measured.is_empty() => SceneTone::new(&settings),
+            None if photographs.is_empty() => SceneTone::new(&settings),
             None => return Err(all_black(input)),
         };
         Ok(Self {
             targets: Targets::in_scene(gpu, scene)?,
             inverted,
             colours: [ColourCounts::of_levels(levels), ColourCounts::new("reference image")],
-            measured: vec![],
+            measured,
         })
     }
 
@@ -360,14 +345,16 @@ impl CurveOnSet {
         &mut self,
         photograph: &Image,
         gaps: &[usize],
-        is_test: bool,
+        listed: &InputPhotograph,
     ) -> Result<(Statistics, Image, Option<f64>)> {
-        let measured = MeasuredPhotograph::measure(&without(photograph, gaps));
+        let known = self.measured.get(&listed.input).cloned();
+        let measured =
+            known.unwrap_or_else(|| MeasuredPhotograph::measure(&without(photograph, gaps)));
         let image = self.targets.tone_mapped(photograph, &measured)?;
         let gain = self.targets.scene.mapping_of(&measured).gain;
         let statistics = measured.statistics;
-        if !is_test {
-            self.measured.push(measured);
+        if listed.split != Some(Split::Test) {
+            self.measured.insert(listed.input.clone(), measured);
         }
         Ok((statistics, image, gain))
     }
@@ -406,8 +393,7 @@ fn mapped(set: &mut CurveOnSet, listed: &InputPhotograph) -> Result<Mapped> {
         Ok(if is_plain { Orientation::from_file(path).upright(image) } else { image })
     };
     let reference = listed.reference.as_ref().map(load).transpose()?;
-    let (statistics, image, gain) =
-        set.result(&photograph, &gaps, listed.split == Some(Split::Test))?;
+    let (statistics, image, gain) = set.result(&photograph, &gaps, listed)?;
     Ok(Mapped { photograph, gaps, statistics, image, gain, reference })
 }
 
@@ -429,12 +415,9 @@ impl Mapped {
             }
             Scores::of_counted(image, reference, Mask::hiding(image, gaps).as_ref())
         });
-        let paper = ToneSettings::new(ToneCurve::Ap3);
-        let alpha = if settings.alpha > 0.0 { settings.alpha } else { paper.alpha };
-        let black_level = ToneSettings { alpha, ..settings.clone() };
         Ok(ToneReport {
             before: Measures::new(&usable, statistics),
-            delta0: black_level.offset(statistics.printed_ratio()),
+            delta0: settings.has_black_level().then(|| settings.offset(statistics.printed_ratio())),
             unusable_pixels: gaps.len(),
             after: Measures::new(&result, &Statistics::new(&result)),
             gain: *gain,
@@ -471,7 +454,11 @@ fn scene(views: &[(&InputPhotograph, ToneReport)]) -> Option<ToneReport> {
     let scores: Vec<Scores> = test.iter().filter_map(|report| report.scores).collect();
     (!views.is_empty()).then(|| ToneReport {
         before: measures(|report| report.before),
-        delta0: training.iter().map(|report| report.delta0).sum::<f64>() / training.len() as f64,
+        delta0: training
+            .iter()
+            .map(|report| report.delta0)
+            .sum::<Option<f64>>()
+            .map(|sum| sum / training.len() as f64),
         unusable_pixels: views.iter().map(|(_, report)| report.unusable_pixels).sum(),
         after: measures(|report| report.after),
         gain: None,

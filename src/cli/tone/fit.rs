@@ -8,7 +8,7 @@ use nightsplat_fit::{
     Channels, CurveFit, CurveScores, Estimate, FitOptions, FitScene, HeldOut, Pair, Weighting,
     cross_validate, fit,
 };
-use nightsplat_photographs::tone::{FAMILIES, Family, ToneCurve};
+use nightsplat_photographs::tone::{CurveChoice, FAMILIES, Tone, ToneCurve};
 use nightsplat_photographs::tree::check_writable;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -28,8 +28,10 @@ pub struct FitArgs {
     /// Folder of the photographs in normal light; PAIRS is then that of the dark ones
     #[arg(long, value_name = "DIR")]
     pub normal: Option<PathBuf>,
-    /// Name of a curve from `nightsplat tone list`, or all
-    #[arg(long, value_name = "NAME|all", default_value_t = FamilyChoice::One(ToneCurve::FittedCubic))]
+    /// Name of a curve from `nightsplat tone list`, all, or a formula of t = x / p90 or of x with named constants, such
+    /// as 'a*t/(t+b); a = 1 in 0.5..2': each has a start and bounds, or starts at 1. A .toml file has them as constants
+    /// and bounds
+    #[arg(long, value_name = "NAME|FORMULA|FILE|all", default_value_t)]
     pub family: FamilyChoice,
     /// Write the best curve, for --curve, or the profile
     #[arg(long, value_name = "FILE.toml")]
@@ -72,13 +74,19 @@ pub struct FitArgs {
     pub json: bool,
 }
 
-/// The families to fit.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+impl Default for FamilyChoice {
+    fn default() -> Self {
+        Self::One(ToneCurve::FittedCubic.into())
+    }
+}
+
+/// The curves to fit.
+#[derive(Clone, Debug, PartialEq)]
 pub enum FamilyChoice {
     /// Every family with constants.
     All,
     /// One.
-    One(ToneCurve),
+    One(CurveChoice),
 }
 
 impl std::str::FromStr for FamilyChoice {
@@ -125,13 +133,13 @@ pub enum WeightingChoice {
     Photographs,
 }
 
-/// A fitted family.
+/// A fitted curve.
 #[derive(Clone, Debug, Serialize)]
 pub struct Fitted {
-    /// The family's name.
-    pub family: &'static str,
+    /// The name of the family, or a formula of one's own.
+    pub family: String,
     /// Its formula.
-    pub formula: &'static str,
+    pub formula: String,
     /// The fit to all pairs.
     pub fit: CurveFit,
     /// Scores on pairs that were not fitted to.
@@ -197,24 +205,26 @@ pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
     let scenes = args.pairs.iter().map(|folder| FitScene::load(folder, args.normal.as_deref()));
     let scenes = scenes.collect::<Result<Vec<FitScene>>>()?;
     let pairs: Vec<&Pair> = scenes.iter().flat_map(|scene| &scene.pairs).collect();
-    let families: Vec<&'static Family> = match args.family {
-        FamilyChoice::One(curve) => vec![curve.family()],
+    let curves: Vec<Tone> = match &args.family {
+        FamilyChoice::One(CurveChoice::Named(curve)) => vec![curve.clone()],
+        FamilyChoice::One(file) => vec![file.settings()?.curve],
         FamilyChoice::All => {
-            FAMILIES.iter().filter(|family| family.curve != ToneCurve::None).collect()
+            let families = FAMILIES.iter().filter(|family| family.curve != ToneCurve::None);
+            families.map(|family| Tone::Formula(family.curve)).collect()
         }
     };
-    let fit_one = |family: &&'static Family| {
+    let fit_one = |curve: &Tone| {
         Ok(Fitted {
-            family: family.name,
-            formula: family.formula,
-            fit: fit(family, &pairs, &options)?,
+            family: curve.name().to_owned(),
+            formula: curve.formula().to_owned(),
+            fit: fit(curve, &pairs, &options)?,
             held_out: args
                 .cross_validate
-                .then(|| cross_validate(family, &scenes, args.folds, &options))
+                .then(|| cross_validate(curve, &scenes, args.folds, &options))
                 .transpose()?,
         })
     };
-    let mut fitted = families.par_iter().map(fit_one).collect::<Result<Vec<Fitted>>>()?;
+    let mut fitted = curves.par_iter().map(fit_one).collect::<Result<Vec<Fitted>>>()?;
     fitted.sort_by(|a, b| b.score().total_cmp(&a.score()));
     if let Some(path) = &args.out {
         write_whole(path, toml(&fitted[0])?.as_bytes())?;
@@ -231,8 +241,9 @@ fn toml(fitted: &Fitted) -> Result<String> {
     let settings = toml::to_string(&fit.settings.clone().rounded()).map_err(|error| {
         Error::output("the curve", format!("cannot be written as TOML: {error}"))
     })?;
+    let title = title(family, formula);
     let mut text = format!(
-        "# {family}: {formula}\n# Fitted to {} values; RMSE {:.4}, {:.2} dB.\n",
+        "# {title}\n# Fitted to {} values; RMSE {:.4}, {:.2} dB.\n",
         fit.values, fit.rmse, fit.psnr.fitted
     );
     if let Some(held_out) = &fitted.held_out {
@@ -245,6 +256,11 @@ fn toml(fitted: &Fitted) -> Result<String> {
         text += &format!("# {} = {}\n", constant.name, with_error(constant));
     }
     Ok(text + &settings)
+}
+
+/// The name of a curve and its formula, once if they are the same.
+fn title(family: &str, formula: &str) -> String {
+    if family == formula { formula.to_owned() } else { format!("{family}: {formula}") }
 }
 
 fn with_error(constant: &Estimate) -> String {
@@ -267,7 +283,7 @@ fn text(fitted: &[Fitted]) -> String {
     let yes = |holds: bool| if holds { "yes" } else { "no" }.to_owned();
     for Fitted { family, fit, held_out, .. } in fitted {
         let mut row = vec![
-            (*family).to_owned(),
+            family.clone(),
             format!("{:.4}", fit.rmse),
             fit.r_squared.map_or_else(|| "-".to_owned(), |r_squared| format!("{r_squared:.4}")),
             format!("{:.2}", fit.psnr.fitted),
@@ -291,7 +307,7 @@ fn text(fitted: &[Fitted]) -> String {
             held_out.psnr.ap3
         ))
     );
-    text += &format!("\n{family}: {formula}\n");
+    text += &format!("\n{}\n", title(family, formula));
     for constant in &fit.constants {
         text += &format!("  {:9} {}\n", constant.name, with_error(constant));
     }

@@ -17,8 +17,8 @@ use crate::{Error, Result};
 /// List the tone curves, print their values or plot them.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ListArgs {
-    /// Names, or .toml, .csv and .cube files [default: all; six for --plot]
-    #[arg(value_name = "NAME|FILE", value_parser = words::curves::<CurveChoice>())]
+    /// Names, formulas, or .toml, .csv and .cube files [default: all]
+    #[arg(value_name = "NAME|FORMULA|FILE", value_parser = words::curves::<CurveChoice>())]
     pub curves: Vec<CurveChoice>,
     /// Plot the curves as SVG
     #[arg(long, value_name = "FILE.svg")]
@@ -43,10 +43,6 @@ pub struct ListArgs {
 const AUTO: &str = "0.075 + 0.925 ((1 - lambda) s(x) + lambda x s(Y) / Y), s(x) = 1 - exp(-k x)
     monotone, bounded; k from the luminance of all photographs, see the guide; drawn over t = k x";
 
-/// The curves of a plot without names, after the automatic curve.
-const PLOTTED: [ToneCurve; 5] =
-    [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Gamma, ToneCurve::Reinhard];
-
 /// A curve with its name.
 struct NamedCurve {
     name: String,
@@ -65,9 +61,7 @@ pub fn text(args: &ListArgs) -> Result<String> {
     if let Some(t) = args.at.iter().find(|&&t| t.is_nan() || t < 0.0) {
         return Err(Error::Usage(format!("--at {t}: t must be 0 or more")));
     }
-    let plotted = auto_and(PLOTTED);
-    let is_plain_plot = args.plot.is_some() && !args.table && args.curves.is_empty();
-    let curves = chosen(if is_plain_plot { &plotted } else { &args.curves })?;
+    let curves = chosen(&args.curves)?;
     let scene = args.dataset.as_deref().map(scene_statistics).transpose()?;
     let mut text = String::new();
     if args.table {
@@ -76,8 +70,7 @@ pub fn text(args: &ListArgs) -> Result<String> {
     if let Some(path) = &args.plot {
         let svg = chart(&curves, scene.as_ref()).svg_file();
         write_whole(path, svg.as_bytes())?;
-        let others = if is_plain_plot { "; name curves to plot others" } else { "" };
-        text += &format!("wrote {}: {} curves{others}\n", path.display(), curves.len());
+        text += &format!("wrote {}: {} curves\n", path.display(), curves.len());
     }
     if !args.table && args.plot.is_none() {
         text = listing(&curves);
@@ -85,13 +78,9 @@ pub fn text(args: &ListArgs) -> Result<String> {
     Ok(text)
 }
 
-/// The automatic curve, then these.
-fn auto_and(formulas: impl IntoIterator<Item = ToneCurve>) -> Vec<CurveChoice> {
-    std::iter::once(Tone::Auto.into()).chain(formulas.into_iter().map(CurveChoice::from)).collect()
-}
-
 fn chosen(choices: &[CurveChoice]) -> Result<Vec<NamedCurve>> {
-    let all = auto_and(ToneCurve::ALL);
+    let formulas = ToneCurve::ALL.into_iter().map(CurveChoice::from);
+    let all: Vec<CurveChoice> = std::iter::once(Tone::Auto.into()).chain(formulas).collect();
     let choices = if choices.is_empty() { &all } else { choices };
     let curve = |choice: &CurveChoice| {
         Ok(NamedCurve { name: choice.to_string(), settings: choice.settings()? })
@@ -117,9 +106,11 @@ fn listing(curves: &[NamedCurve]) -> String {
     for NamedCurve { name, settings } in curves {
         let what = match &settings.curve {
             Tone::Formula(_) => "",
+            Tone::Expression(_) => "a formula of your own, evaluated into a table of values",
             Tone::Auto => AUTO,
             Tone::Table(_) => "a table of values, monotone cubics between them",
             Tone::Profile(_) => "a camera profile: matrix, gain, bias and segments of each channel",
+            Tone::External(_) => "no curve: the targets are made by another program",
         };
         let Some(family) = settings.curve.family() else {
             text += &format!("{name}\n    {what}\n");

@@ -2,12 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::Args;
+use clap::{Args, ValueHint};
 use nightsplat_photographs::dataset::exclude;
 use nightsplat_photographs::scene_tone::SceneTone;
 use toml::Value;
 
-use crate::cli::settings::{CurveOptions, Selection, SettingOptions, push_curve, push_dataset};
+use crate::cli::settings::{
+    CurveOptions, Selection, SettingOptions, push_curve, push_dataset, push_targets,
+};
 use crate::cli::words::{self, NamedValues};
 use crate::train::diagnose::Plan;
 use crate::train::{
@@ -39,6 +41,10 @@ impl Selection for OfTraining {
 struct SeveralSettings {
     #[command(flatten)]
     curve: CurveOptions,
+    /// Folder of targets that another program made, by the names of the photographs and of their size, in any format
+    /// that photographs have; there is no curve then, and no linear light
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::AnyPath, conflicts_with_all = OF_CURVES)]
+    targets: Option<PathBuf>,
     /// TOML file with settings, such as the config.toml of a run
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -66,6 +72,9 @@ struct SeveralSettings {
     #[arg(long, value_name = "NAME", value_parser = words::presets())]
     preset: Option<Preset>,
 }
+
+/// What targets of another program have none of.
+const OF_CURVES: [&str; 7] = ["curve", "profile", "gain", "brightness", "colour", "theta", "law"];
 
 /// What `--frame` sets.
 const OF_FRAME: [&str; 5] = ["frame.center", "frame.scale", "extent", "up", "near"];
@@ -152,6 +161,7 @@ impl TrainOptions {
         several.push_excluded(options)?;
         several.push_frame(options)?;
         several.curve.push(options)?;
+        several.targets.iter().try_for_each(|folder| push_targets(options, folder))?;
         self.push_law(options)?;
         several.push_parts(options)?;
         if self.gives("exposure.start") {

@@ -12,8 +12,10 @@ use nightsplat_photographs::tone::ToneSettings;
 
 use super::placement::Placement;
 use crate::gpu::Gpu;
-use crate::results::eval::{After, Evaluation, Extras, Metric, ModelRenderer, ScoreReference};
-use crate::results::finished_run::{FinishedRun, Opener, is_model};
+use crate::results::eval::{
+    After, Evaluation, Extras, Metric, ModelRenderer, ReferenceKind, ScoreReference,
+};
+use crate::results::finished_run::{FinishedRun, Opener};
 use crate::results::run;
 use crate::splats::model::Model;
 use crate::splats::render::RenderSettings;
@@ -27,10 +29,12 @@ pub(super) struct ModelPhotographs {
     pub(super) gpu: Gpu,
     pub(super) config: TrainConfig,
     pub(super) dataset: Dataset,
-    /// How the photographs become what the model was trained on; of a model file, as far as they tell.
+    /// How the photographs become what the model was trained on; of a file that does not say, by the curve `auto`.
     tone: ToneSettings,
     /// Whether targets have other exposures than renders.
     pub(super) adjusts: bool,
+    /// Whether the model says how its targets are made.
+    states_targets: bool,
 }
 
 /// A larger mean relative error of a distance between two cameras is warned of.
@@ -38,10 +42,11 @@ const LARGE_ERROR: f64 = 0.05;
 
 impl ModelPhotographs {
     pub(super) fn open(model: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
-        let FinishedRun { gpu, config, dataset, .. } = FinishedRun::open(model, dataset, opener)?;
-        let (is_model, learns) = (is_model(model), config.exposure.learn);
-        let tone = if is_model { ToneSettings::default() } else { config.tone.clone() };
-        Ok(Self { gpu, config, dataset, tone, adjusts: is_model || learns })
+        let FinishedRun { gpu, config, dataset, states_targets, .. } =
+            FinishedRun::open(model, dataset, opener)?;
+        let tone = if states_targets { config.tone.clone() } else { ToneSettings::default() };
+        let adjusts = !states_targets || config.exposure.learn;
+        Ok(Self { gpu, config, dataset, tone, adjusts, states_targets })
     }
 
     /// The views for training, including those held out from it.
@@ -62,9 +67,11 @@ impl ModelPhotographs {
         near.unwrap_or(RenderSettings::default().near).into()
     }
 
-    /// What the test views are scored against.
-    pub(super) fn score_reference(&self) -> Result<ScoreReference> {
-        ScoreReference::new(&self.gpu, &self.config.tone, &self.dataset)
+    /// What the test views are scored against; `None` if that is not known.
+    pub(super) fn score_reference(&self) -> Result<Option<ScoreReference>> {
+        let reference = ScoreReference::new(&self.gpu, &self.config.tone, &self.dataset)?;
+        let is_known = self.states_targets || reference.against == ReferenceKind::References;
+        Ok(Some(reference).filter(|_| is_known))
     }
 
     /// The mean PSNR of a model on the test views, dB, with the networks of its run, if it is one; `None` without test
@@ -80,7 +87,7 @@ impl ModelPhotographs {
         let Self { gpu, config, dataset, .. } = self;
         let frame = placement.frame(&config.frame.unwrap_or_default());
         let near = facts.near.or(config.facts(&frame).near);
-        let model = Model::of_shown(gaussians.clone(), &ModelFacts { near, ..*facts });
+        let model = Model::of_shown(gaussians.clone(), &ModelFacts { near, ..facts.clone() });
         let config = TrainConfig { frame: Some(frame), ..config.clone() };
         let features = gaussians.shape.features;
         let networks = match run {

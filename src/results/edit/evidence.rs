@@ -58,14 +58,14 @@ impl<'a> Measured<'a> {
     ) -> Self {
         // Networks act on renders; what a Gaussian adds is measured before them.
         let gaussians = gaussians.with_features(Features::NONE);
-        Self { capture, placement, gaussians, facts: *facts }
+        Self { capture, placement, gaussians, facts: facts.clone() }
     }
 
     fn renderer(&self, gaussians: Gaussians) -> Result<(DeviceGaussians, Renderer)> {
         let ModelPhotographs { gpu, config, .. } = self.capture;
         let frame = self.placement.frame(&config.frame.unwrap_or_default());
         let near = self.facts.near.or(config.facts(&frame).near);
-        let model = Model::of_shown(gaussians, &ModelFacts { near, ..self.facts });
+        let model = Model::of_shown(gaussians, &ModelFacts { near, ..self.facts.clone() });
         let settings = RenderSettings {
             patch_pixels: config.patch_pixels,
             near: (f64::from(model.near) * frame.scale) as f32,
@@ -80,7 +80,7 @@ impl<'a> Measured<'a> {
     }
 
     /// The rendered weight of each Gaussian, (views, count).
-    pub(super) fn weights(&self, mut take: impl FnMut(&[f64])) -> Result<()> {
+    fn weights(&self, mut take: impl FnMut(&[f64])) -> Result<()> {
         let mut white = self.gaussians.with_sh_degree(0);
         white.dc_mut().fill(Vec3::ZERO);
         let (gaussians, mut renderer) = self.renderer(white)?;
@@ -118,6 +118,15 @@ impl<'a> Measured<'a> {
             take(&weights);
         }
         Ok(())
+    }
+
+    /// The rendered weight of each Gaussian over all training views, pixels.
+    pub(super) fn summed_weights(&self) -> Result<Vec<f64>> {
+        let mut sums = vec![0.0; self.gaussians.count];
+        self.weights(|weights| {
+            sums.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight);
+        })?;
+        Ok(sums)
     }
 
     pub(super) fn evidence(&self, targets: &[Option<Image>]) -> Result<Evidence> {

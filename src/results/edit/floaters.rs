@@ -7,6 +7,8 @@
 //! candidate is a floater if the views fit worse with it, by more than chance and by what it adds itself: then it is
 //! not rendered any more, and the others are seen without what it added. All others come back.
 
+use std::cell::Cell;
+
 use glam::DVec3;
 use nightsplat_photographs::image::Image;
 
@@ -61,14 +63,20 @@ pub(super) struct Floaters {
     pub(super) unseen: usize,
 }
 
-/// Finds the floaters of Gaussians.
+/// Finds the floaters of Gaussians. `observe` is called with the number of every round, and the most.
 pub(super) fn find<'a>(
     gaussians: &Gaussians,
     targets: &[Option<Image>],
     cameras: &CameraPositions,
     measured: impl Fn(&Gaussians) -> Measured<'a>,
+    observe: &dyn Fn(usize, usize),
 ) -> Result<Floaters> {
-    let evidence_of = |shares: &[f64]| measured(&faded(gaussians, shares)).evidence(targets);
+    let rounds = Cell::new(0);
+    let evidence_of = |shares: &[f64]| {
+        rounds.set(rounds.get() + 1);
+        observe(rounds.get(), PASSES * (FADE_ROUNDS + SETTLING_ROUNDS));
+        measured(&faded(gaussians, shares)).evidence(targets)
+    };
     let mut keep = vec![true; gaussians.count];
     for _ in 0..PASSES {
         let shares = fade(&keep, evidence_of)?;

@@ -112,6 +112,23 @@ impl Region {
     }
 }
 
+impl Span {
+    /// The indices of what is false.
+    pub(super) fn of_false(keep: &[bool]) -> Vec<Self> {
+        let (mut spans, mut first) = (vec![], 0);
+        for part in keep.chunk_by(|a, b| a == b) {
+            let last = first + part.len() - 1;
+            match (part[0], first == last) {
+                (true, _) => {}
+                (false, true) => spans.push(Self::One(first)),
+                (false, false) => spans.push(Self::Range(first, last)),
+            }
+            first = last + 1;
+        }
+        spans
+    }
+}
+
 impl Scale {
     /// The factor of a number, or of two points.
     pub(super) fn factor(&self) -> Result<Option<f64>, String> {
@@ -162,6 +179,11 @@ impl Operation {
             Self::Up(Some(up)) => Some(DQuat::from_rotation_arc(up.try_normalize()?, DVec3::NEG_Y)),
             _ => None,
         }
+    }
+
+    /// Whether the model renders otherwise afterwards; a transform of the world does not change what its cameras see.
+    pub(crate) fn changes_renders(&self) -> bool {
+        !matches!(self, Self::Up(_) | Self::Scale(_) | Self::Move(_) | Self::Rotate { .. })
     }
 
     /// Whether it needs the photographs or their cameras.

@@ -1,5 +1,6 @@
 //! The scores of test views, a row each.
 
+use nightsplat_core::natural;
 use nightsplat_photographs::metrics::Scores;
 use nightsplat_photographs::tone::ToneSettings;
 use serde_json::{Map, Value, json};
@@ -17,6 +18,8 @@ pub enum Metric {
     PsnrChannelMean,
     /// Mean structural similarity.
     Ssim,
+    /// Mean structural similarity with a uniform window of 7x7 and sample covariances.
+    SsimUniform,
     /// LPIPS.
     Lpips,
     /// The share of the background that shows through, the mean over the unmasked pixels.
@@ -32,6 +35,8 @@ pub enum Metric {
 impl Metric {
     /// Those that compare two images.
     const OF_IMAGES: [Self; 3] = [Self::Psnr, Self::PsnrChannelMean, Self::Ssim];
+    /// Those of the model's own renders.
+    const OF_MODEL: [Self; 4] = [Self::Psnr, Self::PsnrChannelMean, Self::Ssim, Self::SsimUniform];
     /// Those of the background.
     const OF_BACKGROUND: [Self; 2] = [Self::ResidualTransmittance, Self::ResidualTransmittanceQ99];
 
@@ -41,6 +46,7 @@ impl Metric {
             Self::Psnr => "psnr",
             Self::PsnrChannelMean => "psnr_channel_mean",
             Self::Ssim => "ssim",
+            Self::SsimUniform => "ssim_uniform",
             Self::Lpips => "lpips",
             Self::ResidualTransmittance => "mean",
             Self::ResidualTransmittanceQ99 => "q99",
@@ -174,9 +180,14 @@ impl Evaluation {
     }
 
     /// `metrics.json`: means, views, and the resources of the run; unknown values are null.
-    pub(crate) fn json(&self, seconds: Option<f64>, gaussians: usize, steps: Option<u64>) -> Value {
+    pub(crate) fn json(
+        &self,
+        seconds: Option<f64>,
+        gaussians: Option<usize>,
+        steps: Option<u64>,
+    ) -> Value {
         let entry = |view: Option<&str>| {
-            let mut entry = self.entry(view, After::Model, &Metric::OF_IMAGES);
+            let mut entry = self.entry(view, After::Model, &Metric::OF_MODEL);
             let before_denoiser = self.entry(view, After::Gaussians, &Metric::OF_IMAGES);
             if !before_denoiser.is_null() {
                 entry["r0"] = before_denoiser;
@@ -259,6 +270,7 @@ impl Evaluation {
             ("PSNR", 2, Metric::Psnr, After::Model),
             ("channel mean", 2, Metric::PsnrChannelMean, After::Model),
             ("SSIM", 4, Metric::Ssim, After::Model),
+            ("SSIM, uniform", 4, Metric::SsimUniform, After::Model),
             (lpips.as_str(), 4, Metric::Lpips, After::Model),
             // R_0 is the render before the denoiser.
             ("PSNR of R_0", 2, Metric::Psnr, After::Gaussians),
@@ -283,17 +295,23 @@ impl Evaluation {
             (view.unwrap_or("mean").to_owned(), values.collect())
         };
         let mean = (!self.scores.is_empty()).then_some(None);
+        let mut views = self.views();
+        views.sort_by(|a, b| natural::compare(a, b));
         NumberTable {
             title: "Test views".to_owned(),
             label: "view".to_owned(),
             columns: shown.iter().map(column).collect(),
-            rows: self.views().into_iter().map(Some).chain(mean).map(row).collect(),
+            rows: views.into_iter().map(Some).chain(mean).map(row).collect(),
+            ..NumberTable::default()
         }
     }
 }
 
 /// Key in `metrics.json` for what the scores are against, unless it is reference images.
 pub(crate) const AGAINST: &str = "against";
+
+/// Key in `metrics.json` for targets that another program made.
+const TARGETS: &str = "targets";
 
 /// Key in `metrics.json` for what the targets take from reference images, if anything.
 pub(crate) const WITH_REFERENCE: &str = "with_reference";
@@ -305,8 +323,12 @@ pub(crate) fn with_reference(settings: &str) -> String {
     )
 }
 
-/// Adds [`WITH_REFERENCE`] to `metrics.json` if the targets depend on reference images.
+/// Adds [`WITH_REFERENCE`] to `metrics.json` if the targets depend on reference images, and their origin if another
+/// program made them.
 pub(crate) fn add_reference(metrics: &mut Value, tone: &ToneSettings) {
+    if tone.targets().is_some() {
+        metrics[TARGETS] = json!(tone.curve.to_string());
+    }
     if let Some(settings) = tone.knows_references() {
         metrics[WITH_REFERENCE] = json!(settings);
     }

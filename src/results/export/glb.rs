@@ -48,7 +48,7 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
 }
 
 /// The Gaussians with scales as training clamps them; warns where that changes one.
-fn clamped(mut gaussians: Gaussians) -> Gaussians {
+pub(super) fn clamped(mut gaussians: Gaussians) -> Gaussians {
     let mut count = 0;
     let [least, most] = [LOG_SCALE_MIN, LOG_SCALE_MAX].map(|bound| bound as f32);
     for scale in gaussians.log_scales_mut() {

@@ -437,11 +437,17 @@ mod tests {
                 antialiased: true,
                 linear: None,
                 law: SceneLaw::parse("auto 4.25 0.0125 0.075 1 1 0.333"),
+                targets: Some(
+                    r#"{"downscale":4.0,"exclude":["a\u0020b"],"tone.curve":"auto"}"#.to_owned(),
+                ),
                 origin: model.origin,
             };
-            let provenance = Provenance { facts, ..Provenance::default() };
+            let provenance = Provenance { facts: facts.clone(), ..Provenance::default() };
             let (back, stated) = decode(&encode(&model, &provenance).unwrap()).unwrap();
-            assert_eq!((stated, back.origin, back.shape), (facts, model.origin, model.shape));
+            assert_eq!(
+                (stated, back.origin, back.shape),
+                (facts.clone(), model.origin, model.shape)
+            );
             let mut errors = [0.0_f32; 5];
             for i in 0..model.count {
                 let distance = |j: &usize| back.means()[*j].distance(model.means()[i]);

@@ -392,16 +392,19 @@ mod tests {
             antialiased: true,
             linear: None,
             law: SceneLaw::parse("auto 4.25 0.0125 0.075 1 1 0.333"),
+            targets: Some(
+                r#"{"downscale":4.0,"exclude":["a\u0020b"],"tone.curve":"auto"}"#.to_owned(),
+            ),
             origin: model.origin,
         };
-        let provenance = Provenance { facts, ..Provenance::default() };
+        let provenance = Provenance { facts: facts.clone(), ..Provenance::default() };
         for version in [Version::V3, Version::V4] {
             let file = encode(&model, &provenance, version).unwrap();
             if version == Version::V4 {
                 assert_eq!(file[14], ANTIALIASED, "the flag that other readers know");
             }
             let (back, stated) = decode(&file).unwrap();
-            assert_eq!((stated, back.origin, back.shape), (facts, model.origin, model.shape));
+            assert_eq!((&stated, back.origin, back.shape), (&facts, model.origin, model.shape));
             let error = |values: &[f32], back: &[f32]| {
                 values.iter().zip(back).fold(0.0_f32, |most, (a, b)| most.max((a - b).abs()))
             };
@@ -424,7 +427,7 @@ mod tests {
     #[test]
     fn a_truncated_or_edited_file_is_an_error_and_not_a_panic() {
         let facts = ModelFacts { near: Some(0.1), ..ModelFacts::default() };
-        let provenance = Provenance { facts, ..Provenance::default() };
+        let provenance = Provenance { facts: facts.clone(), ..Provenance::default() };
         for version in [Version::V3, Version::V4] {
             let file = encode(&drawn(5, 1), &provenance, version).unwrap();
             // A file of version 4 ends with the text, which is optional.

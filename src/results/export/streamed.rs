@@ -128,7 +128,7 @@ pub fn write(
     }
     let root = tree_of(nodes).ok_or_else(|| Error::Usage("no tile has Gaussians".to_owned()))?;
     let mut asset = json!({ "generator": GENERATOR, "provenance": provenance.lines() });
-    let facts = ModelFacts { origin: origin.unwrap_or_default(), ..provenance.facts };
+    let facts = ModelFacts { origin: origin.unwrap_or_default(), ..provenance.facts.clone() };
     asset["nightsplat"] = facts.json();
     let index = json!({
         "version": 1,

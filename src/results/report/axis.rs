@@ -57,6 +57,11 @@ impl Axis {
         (self.low..=self.high).contains(&value)
     }
 
+    /// The lowest value.
+    pub(super) fn start(&self) -> f64 {
+        self.low
+    }
+
     pub(super) fn ticks(&self) -> Vec<f64> {
         let Some(step) = self.step else {
             let ticks: Vec<f64> = round_values(self.low)

@@ -24,8 +24,8 @@ pub enum Mark {
     Ring,
     /// Dotted steps: level from each point to the next one.
     Steps,
-    /// A horizontal bar from zero to y for each point, labelled with name and value; x is its row. All series of a
-    /// chart are bars, or none.
+    /// A horizontal bar to y for each point, labelled with name and value; x is its row. Bars begin at zero, or at a
+    /// labelled value where the differences would be small beside the bars. All series of a chart are bars, or none.
     Bar,
 }
 
@@ -179,10 +179,8 @@ impl Frame {
             // Names take at most half of the width.
             let left = (7.0 * names as f64 + 12.0).min(width / 2.0);
             let height = TOP + ROW * rows as f64;
-            let (x, y) = (
-                Axis::rows(rows, TOP, height),
-                Axis::around(ys().chain([0.0]), left, width - VALUE),
-            );
+            let x = Axis::rows(rows, TOP, height);
+            let y = Axis::around(ys().chain(bar_start(ys())), left, width - VALUE);
             return Self { x, y, width, height, has_bars };
         }
         let x = match chart.is_logarithmic {
@@ -210,6 +208,12 @@ impl Frame {
     fn axes(&self, chart: &Chart) -> String {
         let mut svg = text(dvec2(0.0, 14.0), "", &chart.y_name);
         if self.has_bars {
+            let start = self.y.start();
+            if start != 0.0 {
+                let x = self.y.from;
+                svg += &text(dvec2(x, TOP - 4.0), "", &format!("from {}", self.y.label(start)));
+                svg += &line(dvec2(x, TOP), dvec2(x, self.height), " stroke=\"var(--line)\"");
+            }
             return svg + "\n";
         }
         let (right, bottom) = (self.width - RIGHT, HEIGHT - BOTTOM);
@@ -311,7 +315,7 @@ impl Frame {
 
     /// Names, bars and values; `ends` are the positions of the drawable points.
     fn bar(&self, series: &Series, ends: &[DVec2], color: &str) -> String {
-        let zero = self.position(0.0, 0.0).x;
+        let zero = self.position(0.0, self.y.start()).x;
         let rows = series.points.iter().filter(|(x, _)| is_drawable(*x, 0.0, false));
         let name = |&(x, _): &(f64, f64)| {
             let at = dvec2(self.y.from - 8.0, self.x.position(x + 0.5) + 4.0);
@@ -332,6 +336,15 @@ impl Frame {
         }
         svg
     }
+}
+
+/// The value at which bars begin: zero, unless all values are far from it and close to each other.
+fn bar_start(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let (low, high) =
+        values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), y| (a.min(y), b.max(y)));
+    let is_far = low <= high && low > 0.0 && low > 0.5 * high;
+    // The lowest keeps a bar.
+    Some(if is_far { low - (0.5 * (high - low)).max(0.02 * low) } else { 0.0 })
 }
 
 /// Written so that a NaN fails. The bound keeps differences finite.

@@ -40,9 +40,27 @@ pub struct NumberTable {
     pub columns: Vec<Column>,
     /// The label and values of each row; a missing value or NaN is shown as a dash.
     pub rows: Vec<(String, Vec<Option<f64>>)>,
+    /// The row and the column of each value that is marked as bad.
+    pub bad: Vec<[usize; 2]>,
 }
 
 impl NumberTable {
+    /// The table without columns that have no value.
+    #[must_use]
+    pub fn without_empty_columns(mut self) -> Self {
+        let has_value =
+            |column: usize| (0..self.rows.len()).any(|row| self.value(row, column).is_some());
+        let kept: Vec<usize> =
+            (0..self.columns.len()).filter(|&column| has_value(column)).collect();
+        self.columns = kept.iter().map(|&column| self.columns[column].clone()).collect();
+        for (_, values) in &mut self.rows {
+            *values = kept.iter().map(|&column| values.get(column).copied().flatten()).collect();
+        }
+        let moved = |&[row, column]: &[usize; 2]| Some([row, kept.binary_search(&column).ok()?]);
+        self.bad = self.bad.iter().filter_map(moved).collect();
+        self
+    }
+
     /// The table as text with aligned columns.
     pub fn text(&self) -> String {
         let Self { label, columns, rows, .. } = self;
@@ -73,7 +91,11 @@ impl NumberTable {
         for (row, (label, _)) in self.rows.iter().enumerate() {
             let _ = write!(html, "<tr><td>{}</td>", escape(label));
             for column in 0..self.columns.len() {
-                let class = if self.is_best(row, column) { " class=\"best\"" } else { "" };
+                let class = match self.bad.contains(&[row, column]) {
+                    true => " class=\"bad\"",
+                    false if self.is_best(row, column) => " class=\"best\"",
+                    false => "",
+                };
                 let _ = write!(html, "<td{class}>{}</td>", self.cell(row, column));
             }
             html.push_str("</tr>\n");

@@ -35,7 +35,7 @@ use super::backup::{self, Backup};
 use super::files::*;
 use super::generations;
 use super::ledger;
-pub use super::progress::Progress;
+pub use super::progress::RunProgress;
 use super::tensorboard::EventFile;
 use crate::gpu::Gpu;
 use crate::loss::Term;
@@ -176,16 +176,16 @@ impl RunDirectory {
     }
 
     /// The intermediate scores up to a step.
-    pub(super) fn progress(&self, step: u64) -> Vec<Progress> {
+    pub(super) fn progress(&self, step: u64) -> Vec<RunProgress> {
         let mut progress = load_progress(&self.path);
         progress.retain(|one| one.step <= step);
         progress
     }
 
     /// Writes the intermediate scores.
-    pub(super) fn save_progress(&self, progress: &[Progress]) -> Result<()> {
-        let lines: String = progress.iter().map(Progress::line).collect();
-        let text = format!("{}\n{lines}", Progress::COLUMNS);
+    pub(super) fn save_progress(&self, progress: &[RunProgress]) -> Result<()> {
+        let lines: String = progress.iter().map(RunProgress::line).collect();
+        let text = format!("{}\n{lines}", RunProgress::COLUMNS);
         write_whole(&self.own_file(PROGRESS)?, text.as_bytes())
     }
 
@@ -227,7 +227,7 @@ impl RunDirectory {
     pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
         let _phase = tracing::info_span!("files").entered();
         self.flush_log()?;
-        flush_to_disk(&self.path, &["config.toml", PLAN, LOG])?;
+        flush_to_disk(&self.path, &["config.toml", PLAN, VIEWS, LOG, HELD_OUT, PROGRESS])?;
         let newest = generations::rotate(&self.path)?;
         trainer.save_checkpoint(&newest)?;
         self.save_trained(trainer)
@@ -313,9 +313,9 @@ impl RunDirectory {
 }
 
 /// The intermediate scores of a run; empty if the test views were scored at the end only.
-pub fn load_progress(run: &Path) -> Vec<Progress> {
+pub fn load_progress(run: &Path) -> Vec<RunProgress> {
     let text = std::fs::read_to_string(run.join(PROGRESS)).unwrap_or_default();
-    text.lines().filter_map(Progress::parse).collect()
+    text.lines().filter_map(RunProgress::parse).collect()
 }
 
 /// A line for every view, with its line break.
@@ -431,7 +431,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let run = create(folder.path(), &TrainConfig::default(), false).unwrap();
         assert!(run.progress(9).is_empty());
-        let progress = |step, seconds, joules| Progress {
+        let progress = |step, seconds, joules| RunProgress {
             step,
             views: 2,
             psnr: 24.5,

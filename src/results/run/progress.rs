@@ -5,7 +5,7 @@ use crate::results::eval::{After, Evaluation, Metric};
 
 /// The mean scores of the test views at one step, and the resources up to it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Progress {
+pub struct RunProgress {
     /// Counted from 1.
     pub step: u64,
     /// The number of scored views.
@@ -26,7 +26,7 @@ pub struct Progress {
     pub gaussians: u64,
 }
 
-impl Progress {
+impl RunProgress {
     pub(super) const COLUMNS: &str =
         "step,views,psnr,psnr_channel_mean,ssim,seconds,processor_seconds,joules,gaussians";
 

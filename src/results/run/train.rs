@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::ImageFile as _;
 
-use super::directory::Progress;
+use super::directory::RunProgress;
 use super::files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE, TRAINED_WITH, trained_with};
 use super::meter::{ResourceMeter, ResourceUsage};
 use super::tensorboard::EventFile;
@@ -114,7 +114,7 @@ pub fn train_in(
     let (ended, evaluation, spent) = finished
         .inspect_err(|error| train_loop.save_on_error(error, &mut trainer, &mut directory))?;
     let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
-    let mut metrics = evaluation.json(Some(spent.seconds), gaussians, Some(steps));
+    let mut metrics = evaluation.json(Some(spent.seconds), Some(gaussians), Some(steps));
     metrics[SPENT] = serde_json::json!(spent);
     eval::add_reference(&mut metrics, &config.tone);
     if let Some(exposure) = trainer.scene().target_exposure(dataset) {
@@ -236,7 +236,7 @@ struct TrainLoop<'a> {
     begin: u64,
     /// Steps in a checkpoint.
     saved: u64,
-    progress: Vec<Progress>,
+    progress: Vec<RunProgress>,
     /// Created at the first scoring.
     score_reference: Option<ScoreReference>,
     /// For `TensorBoard`; created at the first event.
@@ -457,7 +457,7 @@ impl<'a> TrainLoop<'a> {
         self.write_event_scores(step, &evaluation)?;
         if self.config.eval_every > 0 {
             let (gaussians, spent) = (trainer.gaussian_count(), self.meter.spent(0));
-            if let Some(progress) = Progress::new(step, gaussians, &evaluation, &spent) {
+            if let Some(progress) = RunProgress::new(step, gaussians, &evaluation, &spent) {
                 // An extended run begins at a step that was scored before.
                 self.progress.retain(|earlier| earlier.step < step);
                 self.progress.push(progress);

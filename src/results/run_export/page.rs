@@ -1,6 +1,7 @@
 //! The page of a run: its model with bookmarks of views.
 
 use glam::DVec3;
+use nightsplat_core::natural;
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::tone::ToneCurve;
@@ -124,7 +125,9 @@ impl ExportOptions<'_> {
                 pictures: pictures.into_iter().map(turned).collect(),
             })
         };
-        (0..count).map(bookmark).collect()
+        let mut bookmarks = (0..count).map(bookmark).collect::<Result<Vec<_>>>()?;
+        bookmarks.sort_by(|a, b| natural::compare(&a.name, &b.name));
+        Ok(bookmarks)
     }
 }
 

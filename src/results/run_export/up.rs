@@ -69,10 +69,11 @@ impl ExportOptions<'_> {
 
     /// The rotation that maps the model's up direction to that of the format.
     ///
-    /// In every format except the page, up is -y of the model's axes, which is +y in GLB and SPZ. GLB and SPZ, whose
+    /// In every format except the page, up is -y of the model's axes, which is +y in GLB, USD and SPZ. These, whose
     /// readers interpret the axes, are rotated by the run's up direction; PLY and SOG only if `--up` is given.
     pub(super) fn turn(&self, config: &TrainConfig) -> Option<Turn> {
-        let has_axes = matches!(self.format, Format::Glb | Format::Spz(_));
+        let has_axes =
+            matches!(self.format, Format::Glb | Format::Usda | Format::Usdz | Format::Spz(_));
         let is_asked = has_axes || self.up.is_some();
         if self.format == Format::Html || self.up == Some(Up::Keep) || !is_asked {
             return None;

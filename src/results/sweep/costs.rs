@@ -10,7 +10,7 @@ use super::run::FailedPoint;
 use super::table::{ColumnStatistic, KEYS, Quantity};
 use crate::Result;
 use crate::results::report::{Chart, Mark, NumberTable, Report, Series};
-use crate::results::run::{Progress, energy_counters};
+use crate::results::run::{RunProgress, energy_counters};
 
 /// The files of the costs.
 pub const FILES: [&str; 2] = ["costs.csv", "costs.html"];
@@ -153,7 +153,7 @@ impl SweepResults {
         let least = all().map(|one| one.psnr).fold(f64::NEG_INFINITY, f64::max) - SHOWN_DECIBELS;
         let series = |(index, row): (usize, &SweepRow)| {
             let shown = row.progress.iter().filter(|one| one.psnr >= least);
-            let points = shown.map(|one: &Progress| (one.seconds, one.psnr)).collect();
+            let points = shown.map(|one: &RunProgress| (one.seconds, one.psnr)).collect();
             Series { points, mark: Mark::Disc, ..self.series(index) }
         };
         let drawn: Vec<Series> = self.rows.iter().enumerate().take(MAX_NAMES).map(series).collect();

@@ -38,8 +38,8 @@ pub struct Leaderboard<'a> {
     pub title: String,
     /// First paragraphs of the page.
     pub intro: Vec<String>,
-    /// Links of the page: address and text.
-    pub links: Vec<[String; 2]>,
+    /// A page of a model, shown first: address and text.
+    pub window: Option<[String; 2]>,
     /// Mean delta0 of the adaptive black level.
     pub adaptive_offset: Option<f64>,
     pub failures: &'a [FailedPoint],
@@ -145,7 +145,11 @@ impl Leaderboard<'_> {
             let metrics = run.metrics().unwrap_or_default();
             let score = |name: &str| metrics["views"][&view.name][name].as_f64();
             let scores = scored(score("psnr"), score("ssim"));
-            pictures.push(picture(&self.rows.label(row, None), scores, &run.render(gpu, view)?));
+            pictures.push(picture(
+                &self.rows.label(row, None),
+                scores,
+                &run.render(gpu, dataset, view)?,
+            ));
             if pictures.len() > 1 + MAX_PICTURES {
                 break;
             }
@@ -156,8 +160,8 @@ impl Leaderboard<'_> {
     fn html(&self, pictures: Option<Comparison>) -> String {
         let report = Report {
             title: self.title.clone(),
+            window: self.window.clone(),
             intro: self.notes(),
-            links: self.links.clone(),
             tables: vec![self.table()],
             charts: self.charts(),
             comparisons: pictures.into_iter().collect(),

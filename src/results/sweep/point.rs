@@ -12,6 +12,8 @@ pub const PARTS: &str = "parts";
 pub const PLAIN: &str = "plain";
 /// On that axis: every part.
 pub const ALL_PARTS: &str = "all";
+/// The axis of renders of other programs, and the key of their folder in `metrics.json`.
+pub const RENDERS: &str = "renders";
 /// The axis that is averaged over.
 pub const SEED: &str = "seed";
 /// The axis of fixed black levels.
@@ -97,8 +99,8 @@ fn split(list: &str) -> Vec<String> {
         match (character, quote) {
             ('"' | '\'', None) => quote = Some(character),
             (_, Some(open)) if character == open => quote = None,
-            ('[' | '{', None) => depth += 1,
-            (']' | '}', None) => depth -= 1,
+            ('(' | '[' | '{', None) => depth += 1,
+            (')' | ']' | '}', None) => depth -= 1,
             (',', None) if depth == 0 => {
                 parts.push(String::new());
                 continue;

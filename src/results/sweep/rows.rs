@@ -2,10 +2,10 @@
 
 use serde_json::Value;
 
-use super::point::{PARTS, PRESET, SEED, SweepPoint};
+use super::point::{PARTS, PRESET, RENDERS, SEED, SweepPoint};
 use super::run::SweepRun;
 use crate::results::eval::{AGAINST, WITH_REFERENCE};
-use crate::results::run::{Progress, load_progress};
+use crate::results::run::{RunProgress, load_progress};
 
 /// The results of a sweep.
 #[derive(Clone, Debug)]
@@ -32,7 +32,7 @@ pub struct SweepRow {
     /// `metrics.json` of each finished run.
     pub metrics: Vec<Value>,
     /// Intermediate scores of the first finished run.
-    pub progress: Vec<Progress>,
+    pub progress: Vec<RunProgress>,
 }
 
 impl SweepResults {
@@ -83,7 +83,8 @@ impl SweepResults {
     /// The settings of a row as a label, without the axis `except`.
     pub fn label(&self, row: &SweepRow, except: Option<&str>) -> String {
         let speaks = |key: &str| {
-            ["curve", PRESET, PARTS].contains(&key) || (except.is_none() && self.keys.len() == 1)
+            ["curve", PRESET, PARTS, RENDERS].contains(&key)
+                || (except.is_none() && self.keys.len() == 1)
         };
         let word = |key: &String| {
             let value = row.point.value(key)?;

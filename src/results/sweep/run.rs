@@ -2,11 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use nightsplat_photographs::dataset::View;
+use nightsplat_photographs::dataset::{Dataset, View, ViewPictures};
 use nightsplat_photographs::image::Image;
 use serde_json::{Value, json};
 
-use super::point::SweepPoint;
+use super::point::{RENDERS, SweepPoint};
 use crate::Result;
 use crate::gpu::Gpu;
 use crate::results::eval::ModelRenderer;
@@ -45,8 +45,11 @@ impl SweepRun {
         Some(metrics)
     }
 
-    /// Renders a view with the model of the finished run.
-    pub fn render(&self, gpu: &Gpu, view: &View) -> Result<Image> {
+    /// Renders a test view with the model of the finished run, or loads it from the renders of another program.
+    pub fn render(&self, gpu: &Gpu, dataset: &Dataset, view: &View) -> Result<Image> {
+        if let Some(folder) = self.metrics().unwrap_or_default()[RENDERS].as_str() {
+            return ViewPictures::of_tests(Path::new(folder), dataset)?.load(view);
+        }
         let config = run::load_config(&self.folder)?;
         let model = Model::load(&self.folder)?;
         let networks =

@@ -68,6 +68,11 @@ impl Quantity {
         }
     }
 
+    /// Which of its values is best.
+    pub(super) fn best(&self) -> Best {
+        self.best
+    }
+
     /// The mean over the runs of a row, in the displayed unit.
     pub fn mean(&self, row: &SweepRow) -> Option<f64> {
         Some(row.mean(&self.pointer)? / self.unit)
@@ -122,6 +127,7 @@ impl SweepResults {
             label: "point".to_owned(),
             columns: columns.iter().map(column).collect(),
             rows: self.rows.iter().map(row).collect(),
+            ..NumberTable::default()
         }
     }
 

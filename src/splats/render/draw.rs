@@ -5,7 +5,7 @@
 
 use nightsplat_core::camera::{Camera, Patch};
 
-use super::instances::{Instance, VisibleInstances, layout_of, stored};
+use super::instances::{FirstSplat, Instance, VisibleInstances, layout_of, stored};
 use super::target::Target;
 use super::{DepthChannel, ProjectionKind, RenderOptions, Renderer};
 use crate::Result;
@@ -79,7 +79,7 @@ impl HostTargets {
 
 /// What a draw shows.
 #[derive(Clone, Copy)]
-enum Drawing<'a> {
+pub(super) enum Drawing<'a> {
     Model(GaussianSlice<'a>),
     Instances(&'a [Instance<'a>]),
 }
@@ -185,6 +185,12 @@ impl Renderer {
         if target.scene.is_some() {
             self.limits.grow(&self.gpu, pixels)?;
         }
+        if let Some(motion) = &target.motion {
+            self.prepare_motion(motion.image, pixels, 0)?;
+        }
+        if target.pick.is_some() {
+            self.prepare_picks(0)?;
+        }
         if self.host_targets.is_none() {
             self.host_targets = Some(HostTargets::new(&self.gpu)?);
         }
@@ -213,6 +219,11 @@ impl Renderer {
         let layout = layout_of(instances, &self.settings)?;
         self.prepare_draw(&layout, cameras, target)?;
         self.frame.instances.grow(&self.gpu, instances.len())?;
+        if let Some(motion) = &target.motion {
+            let pixels = cameras.iter().map(|camera| Patch::from(camera).pixel_count()).max();
+            self.prepare_picks(pixels.unwrap_or_default())?;
+            self.prepare_motion(motion.image, pixels.unwrap_or_default(), instances.len())?;
+        }
         let view_depths = target.needs_depths();
         for camera in cameras {
             let camera_model = model_number(&camera.model);
@@ -278,8 +289,11 @@ impl Renderer {
         let [color, depth] = [target.color, target.depth]
             .map(|image| image.map(|image| HostImage { layer: image.layer + layer, ..*image }));
         if let Some(scene) = target.scene {
-            let image = HostImage { layer: scene.image.layer + layer, ..*scene.image };
-            self.record_limits(pass, &image, scene.limits(pixel_count), size)?;
+            let mut image = HostImage { layer: scene.image.layer + layer, ..*scene.image };
+            if target.merges_depth() {
+                image.after = ImageState::TRANSFER_TARGET;
+            }
+            self.record_limits(pass, &image, scene.limits(camera), size)?;
         }
         let depths = target.needs_depths().then_some(DepthChannel {
             takes_median: target.depth_kind == super::DepthKind::Median,
@@ -288,7 +302,7 @@ impl Renderer {
         let capacity = self.drawn_capacity(target);
         // The background is mixed in as the image counts colours.
         let before_black = RenderOptions { background: [0.0; 3], ..*options };
-        match drawing {
+        let firsts = match drawing {
             Drawing::Model(gaussians) => {
                 self.record_forward(
                     pass,
@@ -298,6 +312,7 @@ impl Renderer {
                     depths,
                     Some(capacity),
                 )?;
+                vec![FirstSplat { splat: self.context_count() as u32, instance: 0 }]
             }
             Drawing::Instances(instances) => {
                 let visible = VisibleInstances::new(instances, camera, &self.settings);
@@ -306,7 +321,16 @@ impl Renderer {
                 self.record_instances(pass, &visible, &view, options.sh_degree)?;
                 let count = visible.count as u32;
                 self.record_splats(pass, count, &view, &before_black, depths, Some(capacity))?;
+                visible.firsts
             }
+        };
+        if let Some(motion) = &target.motion {
+            let image = HostImage { layer: motion.image.layer + layer, ..*motion.image };
+            let cameras = [camera, &motion.before[layer as usize]];
+            self.record_motion(pass, drawing, cameras, target, &image, &firsts)?;
+        }
+        if let Some(pixel) = target.pick.filter(|_| layer == 0) {
+            self.record_pick(pass, camera, pixel, target.scene.is_some(), firsts)?;
         }
         if target.is_photograph && color.is_some() {
             self.record_photograph(pass, pixel_count)?;
@@ -318,18 +342,7 @@ impl Renderer {
             let taken = HostImage { after: ImageState::TRANSFER_TARGET, ..*image };
             pass.take_image(&taken, size, &mut targets.under);
         }
-        let (encoding, swaps) = target.encoding();
-        let params = pack_pixels::Params {
-            pixel_count,
-            encoding,
-            swaps: swaps.into(),
-            is_over: target.is_over.into(),
-            exposure: target.exposure,
-            background: target.encoded(options.background),
-            depth_plane: plane,
-            is_mean: (target.depth_kind == super::DepthKind::Expected).into(),
-            has_color: color.is_some().into(),
-        };
+        let params = target.packing(camera, options.background, plane);
         pass.dispatch(
             &targets.pack,
             &params,
@@ -337,6 +350,7 @@ impl Renderer {
                 render: frame.render.slice(),
                 transmittances: frame.transmittances.slice(),
                 under: targets.under.slice(),
+                scene: targets.scene_words.slice(),
                 pixels: targets.pixels.slice_mut(),
                 depths: targets.depths.slice_mut(),
             },
@@ -348,7 +362,10 @@ impl Renderer {
             }
             pass.give_image(&targets.pixels, &image, size);
         }
-        if let Some(image) = depth {
+        if let Some(mut image) = depth {
+            if target.merges_depth() {
+                image.before = ImageState::TRANSFER_TARGET;
+            }
             pass.give_image(&targets.depths, &image, size);
         }
         Ok(())

@@ -1,8 +1,9 @@
 //! Many models in one draw, each with a transform of its own, projected into one list and sorted together.
 
+use std::collections::HashMap;
 use std::ops::Range;
 
-use glam::{DAffine3, DMat3, DVec3, Vec3};
+use glam::{DAffine3, DMat3, DVec2, DVec3, Vec3};
 use nightsplat_core::camera::{Camera, CameraModel, deviation_from_rigid};
 
 use super::pipelines::ProjectionKind;
@@ -30,6 +31,8 @@ pub struct Instance<'a> {
     pub clip: Option<[DVec3; 2]>,
     /// Whether it is drawn.
     pub is_visible: bool,
+    /// Its pose and scale in the frame before, for motion vectors; `None`: it has not moved.
+    pub before: Option<(DAffine3, f64)>,
 }
 
 impl<'a> Instance<'a> {
@@ -37,7 +40,7 @@ impl<'a> Instance<'a> {
     pub fn new(gaussians: &'a DeviceGaussians) -> Self {
         let tint = [1.0; 4];
         let pose = DAffine3::IDENTITY;
-        Self { gaussians, pose, scale: 1.0, tint, clip: None, is_visible: true }
+        Self { gaussians, pose, scale: 1.0, tint, clip: None, is_visible: true, before: None }
     }
 
     fn check(&self, index: usize, settings: &RenderSettings) -> Result<()> {
@@ -61,10 +64,23 @@ impl<'a> Instance<'a> {
             let tint = self.tint;
             return refuse(format!("has tint {tint:?}; colours are 0 or more, the opacity 0 to 1"));
         }
+        if let Some((pose, scale)) = self.before {
+            let is_valid = scale.is_finite() && scale > 0.0;
+            if !is_valid || deviation_from_rigid(&pose).is_some() {
+                return refuse("has a pose before that is not rigid, or a scale of 0".to_owned());
+            }
+        }
         if self.clip.is_some_and(|[least, most]| least.is_nan() || most.is_nan()) {
             return refuse("has a clip box with a NaN".to_owned());
         }
         Ok(())
+    }
+
+    /// From a camera's view of it to that of another in the frame before.
+    pub(super) fn before_from_now(&self, camera: &Camera, before: &Camera) -> DAffine3 {
+        let (pose, scale) = self.before.unwrap_or((self.pose, self.scale));
+        Self { pose, scale, ..*self }.view_from_model(before)
+            * self.view_from_model(camera).inverse()
     }
 
     /// From the coordinates of its means to those of a view.
@@ -109,7 +125,8 @@ const DEVIATIONS: f64 = 3.34;
 
 impl GaussianBounds {
     /// What `project` computes, bounded: a splat is within `DEVIATIONS` of its standard deviation on the image, which
-    /// is no more than focal / depth sqrt(1 + slope^2) of that in the world, and the dilation.
+    /// is no more than focal / depth sqrt(1 + slope^2) of that in the world, or focal for parallel rays, and the
+    /// dilation.
     fn may_be_seen(
         &self,
         view_from_model: &DAffine3,
@@ -125,15 +142,19 @@ impl GaussianBounds {
         };
         let corners: [DVec3; 8] = std::array::from_fn(|at| corner(at as u32));
         if corners.iter().all(|corner| corner.z <= f64::from(settings.near)) {
-            return !matches!(camera.model, CameraModel::Pinhole);
+            return matches!(camera.model, CameraModel::Fisheye(_));
         }
-        if !matches!(camera.model, CameraModel::Pinhole) || !self.deviation.is_finite() {
+        if matches!(camera.model, CameraModel::Fisheye(_)) || !self.deviation.is_finite() {
             return true;
         }
+        let is_orthographic = camera.model == CameraModel::Orthographic;
         let kernel = kernels::Camera::from(&camera.into());
-        let size = glam::DVec2::new(camera.width.into(), camera.height.into());
+        let size = DVec2::new(camera.width.into(), camera.height.into());
         let scale = view_from_model.matrix3.x_axis.length();
-        let slopes = kernel.min_slope.abs().max(kernel.max_slope.abs()).as_dvec2();
+        let slopes = match is_orthographic {
+            true => DVec2::ZERO,
+            false => kernel.min_slope.abs().max(kernel.max_slope.abs()).as_dvec2(),
+        };
         let reach = DEVIATIONS
             * scale
             * f64::from(self.deviation)
@@ -142,8 +163,10 @@ impl GaussianBounds {
         (0..2).all(|axis| {
             let slope = |pixel: f64| (pixel - camera.principal_point[axis]) / camera.focal[axis];
             let (low, high) = (slope(-dilated), slope(size[axis] + dilated));
-            let is_right = |point: &DVec3| point[axis] - high * point.z <= reach;
-            let is_left = |point: &DVec3| low * point.z - point[axis] <= reach;
+            // Of the pyramid, or of the box of parallel rays.
+            let width = |point: &DVec3| if is_orthographic { 1.0 } else { point.z };
+            let is_right = |point: &DVec3| point[axis] - high * width(point) <= reach;
+            let is_left = |point: &DVec3| low * width(point) - point[axis] <= reach;
             corners.iter().any(is_right) && corners.iter().any(is_left)
         })
     }
@@ -167,42 +190,52 @@ struct InstancedModel<'a> {
     splats: Range<usize>,
 }
 
+/// The first splat of an instance, and its place in the draw.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct FirstSplat {
+    pub(super) splat: u32,
+    pub(super) instance: usize,
+}
+
 /// The instances that a camera may see.
 pub(super) struct VisibleInstances<'a> {
     models: Vec<InstancedModel<'a>>,
     table: Vec<InstanceView>,
+    /// In ascending order.
+    pub(super) firsts: Vec<FirstSplat>,
     /// Splats of all of them.
     pub(super) count: usize,
 }
 
 impl<'a> VisibleInstances<'a> {
     pub(super) fn new(all: &[Instance<'a>], camera: &Camera, settings: &RenderSettings) -> Self {
-        let mut by_model: Vec<(GaussianSlice<'a>, Vec<&Instance<'a>>)> = vec![];
-        let is_drawn = |instance: &&Instance<'a>| {
+        let mut by_model: Vec<(GaussianSlice<'a>, Vec<(usize, &Instance<'a>)>)> = vec![];
+        let is_drawn = |(_, instance): &(usize, &Instance<'a>)| {
             instance.is_visible && instance.may_be_seen(camera, settings)
         };
-        for instance in all.iter().filter(is_drawn) {
+        let mut models = HashMap::new();
+        for (at, instance) in all.iter().enumerate().filter(is_drawn) {
             let slice = instance.gaussians.slice();
-            let known = by_model
-                .iter_mut()
-                .find(|(known, _)| known.parameters.begins_with(&slice.parameters));
-            match known {
-                Some((_, instances)) => instances.push(instance),
-                None => by_model.push((slice, vec![instance])),
+            let model = *models.entry(slice.parameters.begin()).or_insert(by_model.len());
+            match by_model.get_mut(model) {
+                Some((_, instances)) => instances.push((at, instance)),
+                None => by_model.push((slice, vec![(at, instance)])),
             }
         }
-        let (mut models, mut table, mut count) = (vec![], vec![], 0);
+        let (mut models, mut table, mut firsts, mut count) = (vec![], vec![], vec![], 0);
         for (gaussians, instances) in by_model {
             let first = table.len() as u32;
             let each = splats_of(&gaussians.layout);
-            let views = instances.iter().zip((0..).step_by(each.max(1)));
-            table.extend(views.map(|(instance, first)| instance.view(camera, first)));
+            for (&(at, instance), first) in instances.iter().zip((0..).step_by(each.max(1))) {
+                table.push(instance.view(camera, first));
+                firsts.push(FirstSplat { splat: count as u32 + first, instance: at });
+            }
             let splats = count..count + each * instances.len();
             count = splats.end;
             let instances = first..table.len() as u32;
             models.push(InstancedModel { gaussians, instances, splats });
         }
-        Self { models, table, count }
+        Self { models, table, firsts, count }
     }
 }
 

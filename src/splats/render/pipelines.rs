@@ -10,6 +10,7 @@ use super::limits::{longest_run, segment_length, splats_per_turn, sums_in_shared
 use super::{Purpose, RenderSettings, Renderer, Sort};
 use crate::Result;
 use crate::gpu::{Gpu, Pipeline, Sorting, Tile};
+use crate::kernels::camera::CAMERA_ORTHOGRAPHIC;
 use crate::kernels::{
     blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
@@ -111,6 +112,8 @@ impl Renderer {
             frame: RenderBuffers::new(gpu, settings.channels(), settings.purpose, segments)?,
             limits: gpu.uninit("limits", 1)?,
             host_targets: None,
+            picks: None,
+            motion: None,
             context: None,
             lamp: lamp.transpose()?,
         })
@@ -200,7 +203,7 @@ pub(super) struct WrittenGradients {
 #[derive(Debug)]
 pub(super) struct Projections {
     pub(super) forward: Pipeline<project::Kernel>,
-    /// Absent where the purpose is to show, and with depths.
+    /// Absent where the purpose is to show, of an orthographic camera, and with depths.
     pub(super) backward: Option<Pipeline<project_backward::Kernel>>,
 }
 
@@ -238,7 +241,8 @@ impl Projections {
                 })?
             };
         }
-        let has_gradients = settings.purpose == Purpose::Train && !has_depths && !is_instanced;
+        let is_trained_on = camera_model != CAMERA_ORTHOGRAPHIC && !has_depths && !is_instanced;
+        let has_gradients = settings.purpose == Purpose::Train && is_trained_on;
         let backward = if has_gradients {
             Some(pipeline!(project_backward, color_gradients, frozen_columns))
         } else {

@@ -8,7 +8,7 @@ use nightsplat_core::curves::SceneLaw;
 use serde_json::{Map, Value};
 
 /// Facts that a file states about its model, each with a key and a value, such as `near 0.1`.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct ModelFacts {
     /// The near plane, in world units.
     pub near: Option<f32>,
@@ -22,6 +22,8 @@ pub struct ModelFacts {
     pub linear: Option<f32>,
     /// The curve from the photographs to the displayed colours.
     pub law: Option<SceneLaw>,
+    /// The settings of the run that make its targets from photographs, as JSON without blanks.
+    pub targets: Option<String>,
     /// The world position that positions are relative to.
     pub origin: DVec3,
 }
@@ -32,7 +34,7 @@ impl ModelFacts {
 
     /// Keys and values; without the origin if it is the world's, and of antialiasing only where it is on.
     fn entries(&self) -> Vec<(&'static str, String)> {
-        let Self { near, max_alpha, raw_colors, antialiased, linear, law, origin } = self;
+        let Self { near, max_alpha, raw_colors, antialiased, linear, law, targets, origin } = self;
         let DVec3 { x, y, z } = origin;
         let entry = |key, value: Option<&dyn Display>| Some((key, value?.to_string()));
         let entries = [
@@ -42,6 +44,7 @@ impl ModelFacts {
             antialiased.then(|| ("antialiased", antialiased.to_string())),
             entry("linear", linear.as_ref().map(|value| value as _)),
             entry("law", law.as_ref().map(|value| value as _)),
+            entry("targets", targets.as_ref().map(|value| value as _)),
             (self.origin != DVec3::ZERO).then(|| ("origin", format!("{x} {y} {z}"))),
         ];
         entries.into_iter().flatten().collect()
@@ -55,7 +58,7 @@ impl ModelFacts {
 
     /// As comments of a PLY, which has the origin in one of its own.
     pub(crate) fn comments(&self) -> Vec<String> {
-        Self { origin: DVec3::ZERO, ..*self }.lines()
+        Self { origin: DVec3::ZERO, ..self.clone() }.lines()
     }
 
     /// As an object of JSON.
@@ -98,6 +101,8 @@ impl ModelFacts {
             "antialiased" => self.antialiased = flag(key, value)?,
             "linear" => self.linear = Some(number(key, value, "of stops", |_| true)?),
             "law" => self.law = Some(law(value)?),
+            // A reader of JSON has resolved the blanks within names.
+            "targets" => self.targets = Some(value.trim().replace(' ', "\\u0020")),
             "origin" => self.origin = origin(value)?,
             _ => {}
         }

@@ -178,17 +178,33 @@ impl Writer {
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
     #[cfg(feature = "train")]
-    parts::PartFile::open(path, 1)?;
+    if let Some(file) = parts::PartFile::open(path, 1)? {
+        let gaussians = file.whole()?;
+        check_finite(&gaussians).map_err(|problem| unusable(path, &problem))?;
+        return Ok(gaussians);
+    }
     let bytes = input::bytes(path)?;
-    let (gaussians, _) = parse(&bytes).map_err(|problem| Error::input(path, problem))?;
+    let (gaussians, _) = parse(&bytes).map_err(|problem| unusable(path, &problem))?;
     Ok(gaussians)
+}
+
+/// The error for a file of a model, with what mends most of them.
+pub(crate) fn unusable(path: &Path, problem: &str) -> Error {
+    let remedy = if problem.contains(';') { "" } else { "; export the model again" };
+    Error::input(path, format!("{problem}{remedy}"))
 }
 
 /// The Gaussians of a file, all finite, and the facts that it states.
 pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, ModelFacts), String> {
     let (gaussians, facts) = parse_any(bytes)?;
+    check_finite(&gaussians)?;
+    Ok((gaussians, facts))
+}
+
+/// Names the first number that is not finite.
+fn check_finite(gaussians: &Gaussians) -> Result<(), String> {
     for property in properties(gaussians.shape) {
-        let (begin, stride) = property.address(&gaussians);
+        let (begin, stride) = property.address(gaussians);
         let values = gaussians.parameters.iter().skip(begin).step_by(stride);
         let mut values = values.take(gaussians.count);
         if let Some(vertex) = values.position(|value| !value.is_finite()) {
@@ -196,7 +212,7 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, ModelFacts), String> {
             return Err(format!("vertex {vertex}: `{name}` is {value}, not a finite number"));
         }
     }
-    Ok((gaussians, facts))
+    Ok(())
 }
 
 /// As [`parse`]; numbers may be infinite or NaN.

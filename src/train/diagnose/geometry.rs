@@ -253,7 +253,7 @@ fn center(exposures: &mut [Option<f64>]) {
     exposures.iter_mut().flatten().for_each(|exposure| *exposure -= mean);
 }
 
-pub(super) fn median(mut values: Vec<f64>) -> Option<f64> {
+pub(crate) fn median(mut values: Vec<f64>) -> Option<f64> {
     values.sort_unstable_by(f64::total_cmp);
     let middle = values.len() / 2;
     let lower = values.get(middle.checked_sub(1 - values.len() % 2)?)?;

@@ -16,6 +16,8 @@ pub(super) mod bands;
 pub(super) mod falloff;
 mod fit;
 
+use self::bands::BandsDiagnosis;
+use self::falloff::FalloffDiagnosis;
 pub(super) use self::fit::LampObservations;
 use self::fit::{ALL, ANGLE, LOG_LINEAR, NOTHING};
 
@@ -118,6 +120,23 @@ impl LampDiagnosis {
             points: rows.groups.len(),
         })
     }
+}
+
+/// What lens and shutter do to the light of views with these names, each measured on what the other leaves; `corner` is
+/// u at the corner that is farthest from the axis. The observations are returned without bands.
+pub(super) fn shading(
+    rows: LampObservations,
+    names: &[&str],
+    corner: f64,
+) -> (FalloffDiagnosis, BandsDiagnosis, LampObservations) {
+    let falloff = FalloffDiagnosis::new(&rows, corner);
+    let fall = if falloff.is_found() { rows.fall(falloff.falloff) } else { vec![] };
+    let lifted: Vec<f64> = fall.iter().map(|stops| -stops).collect();
+    let rows = rows.without(&fall);
+    let (bands, in_rows) = BandsDiagnosis::new(&rows, names);
+    let rows = rows.without(&in_rows).without(&lifted);
+    let falloff = if bands.is_found() { FalloffDiagnosis::new(&rows, corner) } else { falloff };
+    (falloff, bands, rows)
 }
 
 /// The variances of a point's brightness over its views that causes leave, on points that they were not fitted to.

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use nightsplat_core::input;
-use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::dataset::{Dataset, RowBands, View};
 use nightsplat_photographs::findings::too_near_white;
 use nightsplat_photographs::tone::{Tone, ToneCurve};
 use serde::{Deserialize, Serialize};
@@ -94,6 +94,20 @@ pub struct PlannedFalloff {
     pub why: String,
 }
 
+/// The bands of rows that the photographs are corrected by, with their reason.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlannedBands {
+    /// Whether they are.
+    pub on: bool,
+    /// Their number and the wave of each photograph.
+    #[serde(default)]
+    pub rows: RowBands,
+    /// The reason with its figure, as a sentence.
+    #[serde(default)]
+    pub why: String,
+}
+
 /// Identifies the dataset of a plan by the names and loaded sizes of its training views.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -136,6 +150,9 @@ pub struct Plan {
     /// The fall-off of the lens.
     #[serde(default)]
     pub falloff: PlannedFalloff,
+    /// Bands of rows.
+    #[serde(default)]
+    pub bands: PlannedBands,
     /// Whether a tone curve makes the targets; otherwise they are the photographs.
     pub curve: PlannedPart,
     /// Whether each view's exposure is learned.
@@ -170,6 +187,7 @@ impl Plan {
             left_out: diagnosis.black_views(),
             dataset: diagnosis.fingerprint.clone(),
             falloff: falloff(scene),
+            bands: bands(scene),
             curve,
             exposure: spread.exposure(),
             lamp: lamp(scene, config),
@@ -190,6 +208,10 @@ impl Plan {
             let [first, second] = self.falloff.falloff;
             set("falloff", first.into())?;
             set("falloff_squared", second.into())?;
+        }
+        if self.bands.on {
+            let rows = Value::try_from(&self.bands.rows);
+            set("bands", rows.map_err(|error| Error::Usage(error.to_string()))?)?;
         }
         if !self.curve.on {
             set("tone.curve", ToneCurve::None.name().into())?;
@@ -221,6 +243,7 @@ impl Plan {
         let number = |name, it: &'a PlannedNumber| (name, it.value.to_string(), it.why.as_str());
         vec![
             ("falloff", switch(self.falloff.on), &self.falloff.why),
+            ("bands", switch(self.bands.on), &self.bands.why),
             part("curve", &self.curve),
             part("exposure", &self.exposure),
             ("lamp", switch(self.lamp.on), &self.lamp.why),
@@ -282,6 +305,20 @@ fn falloff(scene: &SceneDiagnosis) -> PlannedFalloff {
         (false, false) => "",
     };
     PlannedFalloff { on: found.is_corrected, falloff: found.falloff, why: found.why() + remedy }
+}
+
+fn bands(scene: &SceneDiagnosis) -> PlannedBands {
+    let Some(found) = &scene.bands else {
+        let why = scene.lamp_unknown.as_deref().unwrap_or("no points");
+        let why = format!("bands of rows are not measurable: {why}");
+        return PlannedBands { why, ..PlannedBands::default() };
+    };
+    let (rows, remedy) = match (found.is_corrected, found.is_found()) {
+        (true, _) => (found.rows.clone(), "; corrected (bands = {} leaves them)"),
+        (false, true) => (RowBands::default(), "; not corrected"),
+        (false, false) => (RowBands::default(), ""),
+    };
+    PlannedBands { on: found.is_corrected, rows, why: found.why() + remedy }
 }
 
 fn curve(scene: &SceneDiagnosis, config: &TrainConfig) -> PlannedPart {

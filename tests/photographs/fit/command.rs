@@ -12,7 +12,7 @@ fn args(pairs: &[PathBuf]) -> FitArgs {
     FitArgs {
         pairs: pairs.to_vec(),
         normal: None,
-        family: FamilyChoice::One(ToneCurve::Reinhard),
+        family: FamilyChoice::One(ToneCurve::Reinhard.into()),
         out: None,
         channels: ChannelChoice::Rgb,
         weigh: WeightingChoice::Pixels,
@@ -80,6 +80,35 @@ fn a_written_curve_is_accepted_by_other_commands() {
 }
 
 #[test]
+fn a_formula_is_fitted_within_its_bounds_and_written_for_other_commands() {
+    let dir = tempfile::tempdir().unwrap();
+    scene(dir.path(), 3);
+    let (out, plot) = (dir.path().join("mine.toml"), dir.path().join("mine.svg"));
+    let text = "a*t/(t+b); b = 0.5 in 0.01..5";
+    let args = FitArgs {
+        family: text.parse().unwrap(),
+        out: Some(out.clone()),
+        plot: Some(plot.clone()),
+        ..args(&[dir.path().to_owned()])
+    };
+    let fitted = &apply(&args).unwrap()[0];
+    let names: Vec<&str> = fitted.fit.constants.iter().map(|one| one.name.as_ref()).collect();
+    assert_eq!((fitted.family.as_str(), names), ("a*t/(t+b)", vec!["a", "b"]));
+    // Noise of 0.02 leaves 34 dB.
+    assert!(fitted.fit.psnr.fitted > 33.0, "{:?}", fitted.fit.psnr);
+    let choice: CurveChoice = out.to_str().unwrap().parse().unwrap();
+    assert_eq!(choice.settings().unwrap(), fitted.fit.settings.clone().rounded());
+    let written = std::fs::read_to_string(&out).unwrap();
+    for part in ["# a*t/(t+b)\n", "curve = \"a*t/(t+b)\"", "[bounds]", "b = [0.01, 5.0]"] {
+        assert!(written.contains(part), "no {part} in {written}");
+    }
+    assert!(std::fs::read_to_string(plot).unwrap().contains("a*t/(t+b) fitted"));
+    // What was fitted is where the next fit starts.
+    let again = FitArgs { family: out.to_str().unwrap().parse().unwrap(), ..args };
+    assert!((apply(&again).unwrap()[0].fit.psnr.fitted - fitted.fit.psnr.fitted).abs() < 1e-3);
+}
+
+#[test]
 fn pairs_that_cannot_be_used_are_named_in_one_line() {
     let dir = tempfile::tempdir().unwrap();
     let path = |name: &str| dir.path().join(name);
@@ -109,7 +138,7 @@ fn pairs_that_cannot_be_used_are_named_in_one_line() {
         1,
     );
     fails(
-        FitArgs { family: FamilyChoice::One(ToneCurve::None), ..args(&[path("good")]) },
+        FitArgs { family: FamilyChoice::One(ToneCurve::None.into()), ..args(&[path("good")]) },
         "no constants",
         2,
     );

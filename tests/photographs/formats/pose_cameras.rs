@@ -138,6 +138,43 @@ fn what_is_burnt_in_has_no_features_and_is_masked_in_the_dataset() {
 }
 
 #[test]
+fn a_dim_dashboard_has_no_features() {
+    let root = &Folder::empty();
+    let (photos, seen) = (photographed(root), root.join("seen"));
+    let (width, height) = (320, 240);
+    // Instruments of four codes in black, below a scene of thirty.
+    let is_lit = |x: u32, y: u32| {
+        let (dx, dy) = ((x % 80).abs_diff(40), y.abs_diff(210));
+        (250..600).contains(&(dx * dx + dy * dy)) && (x + y) % 5 < 3
+    };
+    for index in 0..9_u32 {
+        let noise = |x: u32, y: u32| ((x * 7919 + y * 104_729 + index * 1_299_709) >> 3) % 3;
+        let code = |x: u32, y: u32| match y {
+            184.. => {
+                if is_lit(x, y) {
+                    4
+                } else {
+                    0
+                }
+            }
+            _ => ((x + 31 * index) / 9 * 7 + (y + 17 * index) / 7 * 13) % 11 * 3,
+        };
+        let value = |x: u32, y: u32| (code(x, y) + noise(x, y)) as f32 / 255.0;
+        let picture = Image::from_fn(width, height, |x, y| [value(x, y); 3]);
+        picture.save_png8(photos.join(format!("v{index:02}.png"))).unwrap();
+    }
+    model(9).write_binary(&root.join("models/0"));
+    let cases = format!("feature_extractor) cp -r $masks {};;\n{}", seen.display(), models(root));
+    let (_, stderr) = run(&line(&photos, &root.join("scene"), &stub(root, &cases), ""), 0);
+    assert!(stderr.contains("hardly changes between views that move"), "{stderr}");
+    let mask = Image::load(seen.join("v08.png.png")).unwrap();
+    let pixels = || (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+    let is_shown = |x: u32, y: u32| mask.data[(width * y + x) as usize] > 0.0;
+    assert!(pixels().all(|(x, y)| y < 184 || !is_lit(x, y) || !is_shown(x, y)), "instruments");
+    assert!(pixels().all(|(x, y)| y >= 168 || is_shown(x, y)), "the scene");
+}
+
+#[test]
 fn few_photographs_start_from_a_closer_pair_and_options_go_to_their_command() {
     let root = &Folder::empty();
     let (photos, out) = (photographed(root), root.join("scene"));

@@ -4,7 +4,7 @@ use std::ffi::c_char;
 
 use nightsplat::Instance;
 
-use super::{NspStep, NspTrainer};
+use super::{NspScore, NspStep, NspTrainer, NspWatch};
 use crate::device::NspDevice;
 use crate::error::{Failure, NSP_ERROR_UNSUPPORTED};
 use crate::model::NspModel;
@@ -21,6 +21,7 @@ pub(super) fn begin(
     _: *mut NspDevice,
     _: *const c_char,
     _: *const c_char,
+    _: *const NspWatch,
 ) -> Result<NspTrainer, Failure> {
     unsupported()
 }
@@ -32,6 +33,14 @@ pub(super) fn advance(
     _: *mut NspStep,
     _: *mut u32,
 ) -> Result<(), Failure> {
+    unsupported()
+}
+
+pub(super) fn has_ended(_: &NspTrainer) -> Result<bool, Failure> {
+    unsupported()
+}
+
+pub(super) fn scores(_: &NspTrainer, _: *mut NspScore, _: &mut u32) -> Result<(), Failure> {
     unsupported()
 }
 

@@ -6,8 +6,9 @@ use std::time::Duration;
 use nightsplat::Instance;
 use nightsplat::gpu::Gpu;
 use nightsplat::train::Trainer;
+use nightsplat_core::watch::Watch;
 
-use super::{NspStep, NspTrainer};
+use super::{NspScore, NspStep, NspTrainer, NspWatch};
 use crate::device::NspDevice;
 use crate::error::{Failure, Object};
 use crate::model::NspModel;
@@ -19,6 +20,7 @@ pub(super) type Training = Object<TrainerOnDevice>;
 #[derive(Debug)]
 pub(super) struct TrainerOnDevice {
     gpu: Gpu,
+    watch: Watch,
     trainer: Trainer,
 }
 
@@ -28,6 +30,7 @@ pub(super) unsafe fn begin(
     device: *mut NspDevice,
     dataset: *const c_char,
     config_toml: *const c_char,
+    watch: *const NspWatch,
 ) -> Result<NspTrainer, Failure> {
     // SAFETY: as the caller promises.
     let (gpu, dataset, config) = unsafe {
@@ -39,8 +42,10 @@ pub(super) unsafe fn begin(
             "a record-only device cannot train; lend its queue with a lock",
         ));
     }
-    let trainer = Trainer::with_settings(gpu, dataset, config)?;
-    Ok(NspTrainer(Object::new(TrainerOnDevice { gpu: gpu.clone(), trainer })))
+    // SAFETY: as the caller promises.
+    let watch = unsafe { watch.as_ref() }.map(|watch| watch.0.clone()).unwrap_or_default();
+    let trainer = watch.during(|| Trainer::with_settings(gpu, dataset, config))?;
+    Ok(NspTrainer(Object::new(TrainerOnDevice { gpu: gpu.clone(), watch, trainer })))
 }
 
 /// # Safety
@@ -52,11 +57,14 @@ pub(super) unsafe fn advance(
     steps: *mut NspStep,
     count: *mut u32,
 ) -> Result<(), Failure> {
-    trainer.0.with("the trainer", |TrainerOnDevice { trainer, .. }| {
+    trainer.0.with("the trainer", |TrainerOnDevice { watch, trainer, .. }| {
         let milliseconds = if milliseconds == 0 { 500 } else { milliseconds };
         let budget = Duration::from_millis(milliseconds.into());
-        let ended = trainer.has_ended();
-        let reports = if ended { vec![] } else { trainer.advance_within(until, budget)? };
+        let until = if trainer.has_ended() { trainer.steps_done() } else { until };
+        let reports = match trainer.has_ended() && !trainer.is_due() {
+            true => vec![],
+            false => watch.during(|| trainer.advance_within(until, budget))?,
+        };
         let gaussians = trainer.gaussian_count() as u32;
         // SAFETY: as the caller promises.
         let Some(count) = (unsafe { count.as_mut() }) else { return Ok(()) };
@@ -72,6 +80,28 @@ pub(super) unsafe fn advance(
         *count = taken as u32;
         Ok(())
     })
+}
+
+pub(super) fn has_ended(trainer: &NspTrainer) -> Result<bool, Failure> {
+    let trainer = &trainer.0.get("the trainer")?.trainer;
+    Ok(trainer.has_ended() && !trainer.is_due())
+}
+
+/// # Safety
+/// As [`nsp_trainer_scores`](super::nsp_trainer_scores).
+pub(super) unsafe fn scores(
+    trainer: &NspTrainer,
+    scores: *mut NspScore,
+    count: &mut u32,
+) -> Result<(), Failure> {
+    let all: Vec<(u64, f64)> = trainer.0.get("the trainer")?.trainer.held_out_scores().collect();
+    let taken = if scores.is_null() { 0 } else { all.len().min(*count as usize) };
+    let struct_size = size_of::<NspScore>();
+    let last = all[all.len() - taken..].iter();
+    // SAFETY: as the caller promises.
+    unsafe { write_all(scores, last.map(|&(step, psnr)| NspScore { struct_size, step, psnr })) }?;
+    *count = taken as u32;
+    Ok(())
 }
 
 /// # Safety
@@ -93,7 +123,7 @@ pub(crate) fn live(trainer: &NspTrainer) -> Result<Instance<'_>, Failure> {
 }
 
 pub(super) fn current(trainer: &mut NspTrainer) -> Result<NspModel, Failure> {
-    trainer.0.with("the trainer", |TrainerOnDevice { gpu, trainer }| {
+    trainer.0.with("the trainer", |TrainerOnDevice { gpu, trainer, .. }| {
         NspModel::new(gpu, trainer.model()?)
     })
 }

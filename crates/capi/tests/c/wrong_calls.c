@@ -292,7 +292,36 @@ static void renders(void)
     DRAW("background", drawn.background[1] = NAN);
     DRAW("exposure", drawn.exposure = NAN);
     DRAW("near plane", drawn.scene_depth = &depth);
-    DRAW("that are written", (drawn.scene_depth = drawn.depth_out = &depth, drawn.flags = NSP_DEPTH_LINEAR));
+    DRAW("color image as well", (other.image = depth.image, drawn.color = &other, drawn.scene_depth = &depth,
+                                 drawn.flags = NSP_DEPTH_LINEAR));
+    DRAW("state your projection", (depth.format = VK_FORMAT_D32_SFLOAT, drawn.depth_out = &depth,
+                                   drawn.flags = NSP_DEPTH_LINEAR));
+    DRAW("near plane", drawn.depth_out = &depth);
+    DRAW("far plane is infinite", (drawn.depth_out = &depth, drawn.scene_near = 1,
+                                   moved.flags = NSP_CAMERA_ORTHOGRAPHIC, drawn.cameras = &moved));
+    DRAW("exclude each other", (moved.flags = NSP_CAMERA_ORTHOGRAPHIC | NSP_CAMERA_FISHEYE, drawn.cameras = &moved));
+    DRAW("hdr10_nits is -1", drawn.hdr10_nits = -1);
+    DRAW("hdr10_nits is NaN", drawn.hdr10_nits = NAN);
+    DRAW("A2B10G10R10", drawn.hdr10_nits = 203);
+    DRAW("NspRender::reserved", drawn.reserved = 1);
+    DRAW("picked pixel", (drawn.flags = NSP_RENDER_PICK, drawn.pick[1] = UINT32_MAX));
+    DRAW("NspCamera is NULL", drawn.motion_out = &color);
+    DRAW("Rg16Float", (drawn.motion_out = &color, drawn.cameras_before = &view));
+    DRAW("one size", (other.format = VK_FORMAT_R16G16_SFLOAT, drawn.motion_out = &other, moved.width = 1,
+                      drawn.cameras_before = &moved));
+    DRAW("is null", (other.format = VK_FORMAT_R16G16_SFLOAT, other.image = VK_NULL_HANDLE, drawn.motion_out = &other,
+                     drawn.cameras_before = &view));
+    NspInstance moving = {.struct_size = sizeof moving, .model = model, .pose_before = {NAN}};
+    NspRender instanced = render(&view, &color);
+    instanced.instances = &moving, instanced.instance_count = 1;
+    EXPECT(NSP_ERROR_USAGE, "pose before", nsp_record_render(renderer, NULL, &instanced));
+    NspPick pick = {.struct_size = 8};
+    EXPECT(NSP_ERROR_VERSION, "NspPick", nsp_renderer_picked(renderer, &pick));
+    EXPECT(NSP_ERROR_USAGE, "NspPick is NULL", nsp_renderer_picked(renderer, NULL));
+    EXPECT(NSP_ERROR_USAGE, "renderer is NULL", nsp_renderer_picked(NULL, &pick));
+    pick.struct_size = sizeof pick;
+    EXPECT(NSP_OK, "", nsp_renderer_picked(renderer, &pick));
+    if (pick.frame != 0 || pick.is_hit) printf("  a pick of nothing\n"), wrong++;
     DRAW("no tone law", drawn.flags = NSP_RENDER_PHOTOGRAPH);
     NspRender drawn = render(&view, &color);
     EXPECT(NSP_OK, "", nsp_record_render(renderer, model, &drawn));
@@ -354,13 +383,34 @@ static void matrices(void)
     EXPECT(NSP_ERROR_USAGE, "is NULL", nsp_camera_from_matrices(NULL, clip, SIDE, SIDE, &made));
 }
 
+/* -- Training ----------------------------------------------------------------------------------------------------- */
+
+static void trainers(void)
+{
+    ready();
+    NspWatch *watch = NULL;
+    NspTrainer *trainer = NULL;
+    NspScore score = {.struct_size = sizeof score};
+    uint32_t count = 1;
+    EXPECT(NSP_ERROR_USAGE, "watch is NULL", nsp_watch_create(NULL, NULL, NULL));
+    EXPECT(NSP_ERROR_USAGE, "watch is NULL", nsp_watch_stop(NULL));
+    nsp_watch_destroy(NULL);
+    EXPECT(NSP_OK, "", nsp_watch_create(NULL, NULL, &watch));
+    EXPECT(NSP_OK, "", nsp_watch_stop(watch));
+    if (nsp_trainer_create(nsp, "absent", NULL, watch, &trainer) >= 0) printf("  a trainer of nothing\n"), wrong++;
+    EXPECT(NSP_ERROR_USAGE, "trainer is NULL", nsp_trainer_advance(NULL, 1, 1, NULL, NULL));
+    EXPECT(NSP_ERROR_USAGE, "trainer is NULL", nsp_trainer_scores(NULL, &score, &count));
+    if (nsp_trainer_has_ended(NULL)) printf("  nothing has ended\n"), wrong++;
+    nsp_watch_destroy(watch);
+}
+
 /* -- All ---------------------------------------------------------------------------------------------------------- */
 
 #define CASE(name) {#name, name}
 static const struct { const char *name; void (*run)(void); } cases[] = {
     CASE(a_loader_that_knows_nothing), CASE(an_instance_of_1_0), CASE(an_instance_of_1_1), CASE(an_instance_of_1_2),
     CASE(features_that_are_missing), CASE(members_of_a_host), CASE(an_allocator_that_gives_nothing), CASE(models),
-    CASE(renders), CASE(a_recording_that_is_dropped), CASE(matrices),
+    CASE(renders), CASE(a_recording_that_is_dropped), CASE(matrices), CASE(trainers),
 };
 
 int main(int argc, char **argv)

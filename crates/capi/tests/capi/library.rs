@@ -132,6 +132,66 @@ fn the_c_host_draws_our_own_render_without_a_message() {
     assert!(error.contains("nsp_model_load: absent.ply") && error.contains("(-3)"), "{error}");
 }
 
+/// `find_package`, and a program of one source.
+const CMAKE: &str = "cmake_minimum_required(VERSION 3.16)
+project(host C)
+find_package(nightsplat CONFIG REQUIRED)
+add_executable(host host.c)
+target_link_libraries(host PRIVATE nightsplat::nightsplat)
+";
+
+/// As an archive of a release is, wherever it is unpacked.
+#[test]
+fn pkg_config_and_cmake_find_the_library_in_a_prefix_that_was_moved() {
+    if !has_vulkan_headers() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let prefix = folder.path().join("moved here");
+    std::fs::create_dir(&prefix).unwrap();
+    let copied = Command::new("cp")
+        .args(["-a"])
+        .args(["include", "lib"].map(|part| library().join(part)))
+        .arg(&prefix)
+        .status()
+        .unwrap();
+    assert!(copied.success());
+    let source = folder.path().join("host.c");
+    let program =
+        "#include <nightsplat.h>\nint main(void) { return nsp_version() != NSP_HEADER_VERSION; }\n";
+    std::fs::write(&source, program).unwrap();
+    let succeeds = |command: &mut Command| match command.output() {
+        Ok(done) if done.status.success() => Some(String::from_utf8(done.stdout).unwrap()),
+        Ok(done) => panic!("{command:?}: {}", String::from_utf8_lossy(&done.stderr)),
+        Err(error) => {
+            let program = command.get_program().to_string_lossy();
+            not_run("build-tools", format_args!("no {program}: {error}"));
+            None
+        }
+    };
+    let runs = |host: &Path| {
+        let lib = prefix.join("lib");
+        succeeds(Command::new(host).env("LD_LIBRARY_PATH", lib)).unwrap();
+    };
+    let mut pkg_config = Command::new("pkg-config");
+    pkg_config.env("PKG_CONFIG_PATH", prefix.join("lib/pkgconfig"));
+    if let Some(flags) = succeeds(pkg_config.args(["--cflags", "--libs", "nightsplat"])) {
+        let host = folder.path().join("by-pkg-config");
+        let line = format!("cc {} -o {} {flags}", source.display(), host.display());
+        succeeds(Command::new("sh").args(["-c", &line])).unwrap();
+        runs(&host);
+    }
+    std::fs::write(folder.path().join("CMakeLists.txt"), CMAKE).unwrap();
+    let build = folder.path().join("build");
+    let mut configure = Command::new("cmake");
+    configure.arg("-S").arg(folder.path()).arg("-B").arg(&build);
+    configure.arg(format!("-DCMAKE_PREFIX_PATH={}", prefix.display()));
+    if succeeds(&mut configure).is_some() {
+        succeeds(Command::new("cmake").arg("--build").arg(&build)).unwrap();
+        runs(&build.join("host"));
+    }
+}
+
 #[test]
 fn no_wrong_call_ends_the_process() {
     if !has_vulkan_headers() {
@@ -249,11 +309,17 @@ fn every_member_is_where_c_has_it() {
         NspImage { struct_size, image, format, extent, layer, layers, before, after }
         NspRender {
             struct_size, commands, frame, cameras, camera_count, flags, color, depth_out, scene_depth, scene_near,
-            scene_far, exposure, background, budget, instance_count, instances,
+            scene_far, exposure, background, budget, instance_count, instances, hdr10_nits, pick,
+            reserved, motion_out, cameras_before,
         }
-        NspInstance { struct_size, model, trainer, pose, scale, tint, clip_min, clip_max, flags, reserved }
+        NspInstance {
+            struct_size, model, trainer, pose, scale, tint, clip_min, clip_max, flags, reserved, pose_before,
+            scale_before,
+        }
         NspStatus { struct_size, frame, intersections, capacity, left_out, splats_per_tile, device_bytes }
+        NspPick { struct_size, frame, is_hit, instance, gaussian, depth }
         NspStep { struct_size, step, loss, gaussians, reserved }
+        NspScore { struct_size, step, psnr }
     };
     let folder = tempfile::tempdir().unwrap();
     let source = folder.path().join("offsets.c");

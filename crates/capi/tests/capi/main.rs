@@ -34,6 +34,7 @@ use nightsplat_capi::instance::*;
 use nightsplat_capi::model::*;
 use nightsplat_capi::render::*;
 use nightsplat_capi::train::*;
+use nightsplat_core::camera::CameraModel;
 use nightsplat_core::random::Stream;
 use nightsplat_photographs::image::linear_from_srgb;
 use nightsplat_photographs::tone::{
@@ -207,6 +208,11 @@ fn render(
         budget: 0,
         instance_count: 0,
         instances: null(),
+        hdr10_nits: 0.0,
+        pick: [0; 2],
+        reserved: 0,
+        motion_out: null(),
+        cameras_before: null(),
     }
 }
 
@@ -223,6 +229,8 @@ fn whole(model: *const NspModel) -> NspInstance {
         clip_max: [0.0; 3],
         flags: 0,
         reserved: 0,
+        pose_before: [0.0; 12],
+        scale_before: 0.0,
     }
 }
 
@@ -519,7 +527,7 @@ fn an_engines_matrices_give_the_camera_whatever_its_axes() {
         // y up, z forward: Unity's axes.
         (flips(Vec3::new(1.0, -1.0, 1.0)), turned * left_handed),
     ];
-    for (view, projection) in cases {
+    let of_matrices = |view: &Mat4, projection: &Mat4| {
         // SAFETY: a valid struct of numbers.
         let mut camera: NspCamera = unsafe { std::mem::zeroed() };
         camera.struct_size = size_of::<NspCamera>();
@@ -533,10 +541,28 @@ fn an_engines_matrices_give_the_camera_whatever_its_axes() {
                 &mut camera,
             )
         });
-        let converted = camera.camera().unwrap();
+        camera.camera().unwrap()
+    };
+    for (view, projection) in cases {
+        let converted = of_matrices(&view, &projection);
         let focal = f64::from(height) / 2.0 / f64::from(vertical / 2.0).tan();
         assert!((converted.focal - focal).abs().max_element() < 1e-2, "{converted:?}");
         assert!((converted.principal_point - glam::DVec2::new(320.0, 240.0)).length() < 1e-3);
+        assert!(converted.view_from_world.abs_diff_eq(pose, 1e-6), "{converted:?}");
+    }
+    // Eight world units wide and off the axis, with the depth reversed or not.
+    let backward = Mat4::orthographic_rh(-3.0, 5.0, -3.0, 3.0, near, 50.0);
+    let forward = Mat4::orthographic_lh(-3.0, 5.0, -3.0, 3.0, 50.0, near);
+    let parallel = [
+        (flips(Vec3::new(1.0, -1.0, -1.0)), turned * backward),
+        (flips(Vec3::ONE), forward),
+        (flips(Vec3::new(1.0, -1.0, 1.0)), turned * forward),
+    ];
+    for (view, projection) in parallel {
+        let converted = of_matrices(&view, &projection);
+        assert_eq!(converted.model, CameraModel::Orthographic);
+        assert!((converted.focal - 80.0).abs().max_element() < 1e-3, "{converted:?}");
+        assert!((converted.principal_point - glam::DVec2::new(240.0, 240.0)).length() < 1e-3);
         assert!(converted.view_from_world.abs_diff_eq(pose, 1e-6), "{converted:?}");
     }
     let refuse = |view: &Mat4, projection: &Mat4, word: &str| {
@@ -550,8 +576,7 @@ fn an_engines_matrices_give_the_camera_whatever_its_axes() {
         };
         refused(result, NSP_ERROR_USAGE, &["nsp_camera_from_matrices", word]);
     };
-    let orthographic = Mat4::orthographic_rh(-1.0, 1.0, -1.0, 1.0, 0.1, 10.0);
-    refuse(&Mat4::IDENTITY, &orthographic, "perspective");
+    refuse(&Mat4::IDENTITY, &Mat4::ZERO, "neither perspective nor orthographic");
     let mut sheared = left_handed;
     sheared.y_axis.x = 0.5;
     refuse(&Mat4::IDENTITY, &sheared, "sheared");

@@ -157,6 +157,15 @@ fn every_bad_render_is_refused_by_code_and_name_and_nothing_is_recorded() {
     session.end();
 }
 
+/// Appends a line of the log to the vector that `user` is.
+unsafe extern "C" fn keep_line(user: *mut c_void, level: i32, line: *const c_char) {
+    // SAFETY: as the test sets it; one call at a time.
+    unsafe {
+        let lines = &mut *user.cast::<Vec<(i32, String)>>();
+        lines.push((level, CStr::from_ptr(line).to_str().unwrap().to_owned()));
+    }
+}
+
 #[test]
 fn every_bad_model_is_refused_by_code_and_name() {
     let mut session = Session::new(|_| {});
@@ -176,6 +185,23 @@ fn every_bad_model_is_refused_by_code_and_name() {
     broken.means_mut().fill(Vec3::NAN);
     broken.save(folder.join("nan.ply")).unwrap();
     load(&folder.join("nan.ply"), NSP_ERROR_INPUT, &["nan.ply", "NaN"]);
+    // A part of them is left out, which the log says.
+    broken.means_mut()[1..].fill(Vec3::ZERO);
+    broken.save(folder.join("part.ply")).unwrap();
+    let mut lines: Vec<(i32, String)> = vec![];
+    // SAFETY: valid; the log is another before `lines` ends.
+    unsafe {
+        nsp_set_log(Some(keep_line), (&raw mut lines).cast());
+        let result = nsp_model_load(device, c_path(&folder.join("part.ply")).as_ptr(), &mut model);
+        nsp_set_log(None, null_mut());
+        ok(result);
+        nsp_model_destroy(model);
+    }
+    let is_warned = |(level, line): &(i32, String)| {
+        *level == 2 && line.contains("part.ply: 1 of ") && line.contains("are left out")
+    };
+    assert!(lines.iter().any(is_warned), "{lines:?}");
+    model = null_mut();
     // SAFETY: NULL and the rest are refused.
     unsafe {
         let result = nsp_model_load(device, null(), &mut model);
@@ -207,7 +233,7 @@ fn every_bad_model_is_refused_by_code_and_name() {
     let mut trainer = null_mut();
     // SAFETY: valid.
     unsafe {
-        let result = nsp_trainer_create(device, c".".as_ptr(), null(), &mut trainer);
+        let result = nsp_trainer_create(device, c".".as_ptr(), null(), null(), &mut trainer);
         refused(result, NSP_ERROR_USAGE, &["nsp_trainer_create", "record-only"]);
     }
     other.end();
@@ -388,7 +414,8 @@ fn a_lost_device_is_a_code_and_everything_can_be_destroyed() {
     let mut trainer = null_mut();
     // SAFETY: valid.
     unsafe {
-        let result = nsp_trainer_create(session.device, dataset.as_ptr(), null(), &mut trainer);
+        let result =
+            nsp_trainer_create(session.device, dataset.as_ptr(), null(), null(), &mut trainer);
         refused(result, NSP_ERROR_LOST, &["nsp_trainer_create", "was lost"]);
         assert!(trainer.is_null());
         ok(nsp_frames_done(session.device, u64::MAX));

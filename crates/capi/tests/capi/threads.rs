@@ -20,6 +20,35 @@ unsafe extern "C" fn unlock_queue(_: *mut c_void, _: vk::Queue) {
     GUARD.with_borrow_mut(|held| *held = None);
 }
 
+/// What a watch told: stages, and the last of `training`.
+#[derive(Default)]
+struct Told {
+    stages: Vec<String>,
+    steps: u64,
+    /// The stage at which it stops.
+    stops_at: Option<&'static str>,
+    watch: *mut NspWatch,
+}
+
+/// # Safety
+/// `user` is a lock with a [`Told`] in it.
+unsafe extern "C" fn tell(user: *mut c_void, stage: *const c_char, done: u64, all: u64) {
+    // SAFETY: as above; the stage ends with NUL.
+    let (told, stage) = unsafe { (&*user.cast::<Mutex<Told>>(), CStr::from_ptr(stage)) };
+    let (mut told, stage) = (told.lock().unwrap(), stage.to_str().unwrap().to_owned());
+    assert!(done <= all, "{stage}: {done} of {all}");
+    if stage == "training" {
+        told.steps = done;
+    }
+    if told.stops_at == Some(stage.as_str()) {
+        // SAFETY: the watch lives as long as what it follows.
+        ok(unsafe { nsp_watch_stop(told.watch) });
+    }
+    if !told.stages.contains(&stage) {
+        told.stages.push(stage);
+    }
+}
+
 #[test]
 fn a_trainer_and_its_host_submit_from_two_threads_under_the_hosts_lock() {
     let session = Session::with_flags(0, |lent| {
@@ -49,9 +78,22 @@ fn a_trainer_and_its_host_submit_from_two_threads_under_the_hosts_lock() {
         });
         let device = device.get();
         let mut trainer = null_mut();
+        let told = Mutex::new(Told::default());
         // SAFETY: everything is valid, on this thread alone but for the device.
         unsafe {
-            ok(nsp_trainer_create(device, dataset.as_ptr(), config.as_ptr(), &mut trainer));
+            let mut watch = null_mut();
+            let user = (&raw const told).cast_mut().cast();
+            ok(nsp_watch_create(Some(tell), user, &mut watch));
+            told.lock().unwrap().watch = watch;
+            for stage in ["decoding photographs", "uploading photographs"] {
+                told.lock().unwrap().stops_at = Some(stage);
+                let (dataset, config) = (dataset.as_ptr(), config.as_ptr());
+                let stopped = nsp_trainer_create(device, dataset, config, watch, &mut trainer);
+                refused(stopped, NSP_ERROR_STOPPED, &["nsp_trainer_create", "stopped on request"]);
+                assert!(trainer.is_null());
+            }
+            told.lock().unwrap().stops_at = None;
+            ok(nsp_trainer_create(device, dataset.as_ptr(), config.as_ptr(), watch, &mut trainer));
             let (mut last, mut steps) = (
                 0,
                 [NspStep {
@@ -62,12 +104,31 @@ fn a_trainer_and_its_host_submit_from_two_threads_under_the_hosts_lock() {
                     reserved: 0,
                 }; 64],
             );
-            while last < 40 {
+            let mut stops = 0;
+            while nsp_trainer_has_ended(trainer) == 0 {
                 let mut count = 64;
-                ok(nsp_trainer_advance(trainer, 40, 20, steps.as_mut_ptr(), &mut count));
-                assert!(count > 0, "the training ended at step {last}");
-                last = steps[count as usize - 1].step;
+                if last >= 20 && stops == 0 {
+                    ok(nsp_watch_stop(watch));
+                }
+                let done = nsp_trainer_advance(trainer, 40, 20, steps.as_mut_ptr(), &mut count);
+                if done == NSP_ERROR_STOPPED {
+                    stops += 1;
+                    continue;
+                }
+                ok(done);
                 assert!(steps[..count as usize].iter().all(|step| step.loss.is_finite()));
+                last = steps[..count as usize].last().map_or(last, |step| step.step);
+            }
+            assert_eq!((last, stops), (40, 1));
+            let mut scores =
+                [NspScore { struct_size: size_of::<NspScore>(), step: 0, psnr: 0.0 }; 4];
+            let mut count = 4;
+            ok(nsp_trainer_scores(trainer, scores.as_mut_ptr(), &mut count));
+            assert!(count > 0 && scores[count as usize - 1].step == 40, "{scores:?}");
+            assert!(scores[..count as usize].iter().all(|score| score.psnr > 3.0), "{scores:?}");
+            let stages = std::mem::take(&mut told.lock().unwrap().stages);
+            for stage in ["compiling kernels", "training", "scoring views"] {
+                assert!(stages.iter().any(|told| told == stage), "{stage}: {stages:?}");
             }
             let mut model = null_mut();
             ok(nsp_trainer_model(trainer, &mut model));
@@ -108,12 +169,71 @@ fn a_trainer_and_its_host_submit_from_two_threads_under_the_hosts_lock() {
             let saved = c_path(&session.folder.path().join("trained.spz"));
             ok(nsp_trainer_save(trainer, saved.as_ptr()));
             nsp_trainer_destroy(trainer);
+            nsp_watch_destroy(watch);
         }
         is_done.store(true, Ordering::Release);
     });
     assert!(session.folder.path().join("trained.spz").exists());
     let (locked, submitted) = (LOCKED.load(Ordering::Acquire), submitted.load(Ordering::Acquire));
     assert!(submitted > 0 && locked > submitted, "{locked} locks, {submitted} of the host's");
+    session.end();
+}
+
+/// Scores and rounds of density control are divided among calls, and no bit depends on how. Prints how long the calls
+/// of a budget take.
+#[test]
+fn calls_keep_to_their_time_and_train_the_same_bits() {
+    let session = Session::with_flags(0, |_| {});
+    let dataset = session.folder.path().join("dataset");
+    let options =
+        SyntheticOptions { width: 96, height: 72, views: 16, ..SyntheticOptions::default() };
+    write(&dataset, &options).unwrap();
+    let dataset = c_path(&dataset);
+    let config = CString::new("steps = 120\n[schedule]\ndensify_interval = 20\n").unwrap();
+    let none = NspStep {
+        struct_size: size_of::<NspStep>(),
+        step: 0,
+        loss: 0.0,
+        gaussians: 0,
+        reserved: 0,
+    };
+    let train = |milliseconds: u32| {
+        let mut trainer = null_mut();
+        let (mut last, mut calls, mut steps) = (none, vec![], [none; 64]);
+        let mut scores = [NspScore { struct_size: size_of::<NspScore>(), step: 0, psnr: 0.0 }; 8];
+        let mut scored = 8;
+        // SAFETY: everything is valid, on this thread alone.
+        unsafe {
+            let device = session.device;
+            ok(nsp_trainer_create(device, dataset.as_ptr(), config.as_ptr(), null(), &mut trainer));
+            while nsp_trainer_has_ended(trainer) == 0 {
+                let (begin, mut count) = (std::time::Instant::now(), 64);
+                let steps = steps.as_mut_ptr();
+                ok(nsp_trainer_advance(trainer, u64::MAX, milliseconds, steps, &mut count));
+                calls.push(begin.elapsed());
+                if count > 0 {
+                    last = *steps.add(count as usize - 1);
+                }
+            }
+            ok(nsp_trainer_scores(trainer, scores.as_mut_ptr(), &mut scored));
+            nsp_trainer_destroy(trainer);
+        }
+        calls.sort_unstable();
+        let [median, most] = [calls[calls.len() / 2], calls[calls.len() - 1]];
+        println!("{milliseconds} ms: {} calls, median {median:?}, at most {most:?}", calls.len());
+        let scores =
+            scores[..scored as usize].iter().map(|score| (score.step, score.psnr.to_bits()));
+        (last.step, last.loss.to_bits(), last.gaussians, scores.collect::<Vec<_>>(), calls.len())
+    };
+    let (step, loss, gaussians, scores, in_long_calls) = train(60_000);
+    assert_eq!(step, 120);
+    assert!(!scores.is_empty());
+    for milliseconds in [200, 50, 1] {
+        let (other_step, other_loss, others, other_scores, many) = train(milliseconds);
+        assert_eq!((other_step, other_loss, others), (step, loss, gaussians));
+        assert_eq!(other_scores, scores);
+        assert!(many > in_long_calls, "{many} calls");
+    }
     session.end();
 }
 

@@ -12,6 +12,8 @@ pub enum CameraModel {
     Pinhole,
     /// `OPENCV_FISHEYE`: a polynomial of the angle off the axis.
     Fisheye(KannalaBrandt),
+    /// Parallel: x and y, where the focal lengths are pixels per world unit. It is rendered, not trained on.
+    Orthographic,
 }
 
 /// The polynomial of a fisheye (Kannala and Brandt 2006, as in `OpenCV` and COLMAP): the angle t off the axis is
@@ -72,12 +74,12 @@ impl KannalaBrandt {
 }
 
 impl CameraModel {
-    /// The depth of a view-space point (x right, y down, z forward), for sorting and the near plane: z for a pinhole,
-    /// the distance for a fisheye. `None` outside the field of view.
+    /// The depth of a view-space point (x right, y down, z forward), for sorting and the near plane: the
+    /// distance for a fisheye, else z. `None` outside the field of view.
     #[doc(hidden)]
     pub fn depth(&self, point: DVec3) -> Option<f64> {
         match self {
-            Self::Pinhole => Some(point.z).filter(|&z| z > 0.0),
+            Self::Pinhole | Self::Orthographic => Some(point.z).filter(|&z| z > 0.0),
             Self::Fisheye(lens) => {
                 let angle = point.truncate().length().atan2(point.z);
                 (point.z > 0.0 && angle < lens.largest_angle()).then(|| point.length())
@@ -91,6 +93,7 @@ impl CameraModel {
         self.depth(point)?;
         Some(match self {
             Self::Pinhole => point.truncate() / point.z,
+            Self::Orthographic => point.truncate(),
             Self::Fisheye(lens) => {
                 let across = point.truncate();
                 let angle = across.length().atan2(point.z);
@@ -105,6 +108,7 @@ impl CameraModel {
     pub fn point(&self, position: DVec2, depth: f64) -> Option<DVec3> {
         match self {
             Self::Pinhole => Some(position.extend(1.0) * depth),
+            Self::Orthographic => Some(position.extend(depth)),
             Self::Fisheye(lens) => {
                 let (sin, cos) = lens.angle(position.length())?.sin_cos();
                 Some((sin * position.normalize_or(DVec2::X)).extend(cos) * depth)
@@ -142,6 +146,10 @@ mod tests {
         let position = DVec2::new(0.4, -3.0);
         let point = CameraModel::Pinhole.point(position, 2.0).unwrap();
         assert_eq!((point.z, CameraModel::Pinhole.project(point)), (2.0, Some(position)));
+        let point = CameraModel::Orthographic.point(position, 2.0).unwrap();
+        assert_eq!(point, DVec3::new(0.4, -3.0, 2.0));
+        assert_eq!(CameraModel::Orthographic.project(point), Some(position));
+        assert_eq!(CameraModel::Orthographic.project(-DVec3::Z), None);
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! A curve is a row here and a function in `include/curves.glsl`. The command line, the help texts, `nightsplat tone
 //! list`, TOML files and fitting all read this table; a row's formula is also the reference of the kernels.
 
+use std::borrow::Cow;
 use std::f64::consts::FRAC_PI_2;
 
 use super::real::Real;
@@ -66,7 +67,7 @@ macro_rules! families {
             name: $name,
             formula: $formula,
             constants: &[$(Constant {
-                name: stringify!($constant),
+                name: Cow::Borrowed(stringify!($constant)),
                 default: $default,
                 start: families!(@start $default $($start)?),
                 bounds: [$low, $high],

@@ -1,5 +1,7 @@
 //! Rows of the table of curves: values, derivatives and gradients.
 
+use std::borrow::Cow;
+
 use super::real::{Dual, Real, within};
 
 use super::catalogue::{Constants, FAMILIES, ToneCurve, curve_shape};
@@ -21,11 +23,11 @@ pub enum White {
     ChannelMeans,
 }
 
-/// A constant of a family.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// A constant of a formula.
+#[derive(Clone, Debug, PartialEq)]
 pub struct Constant {
     /// Its name in the formula and in TOML files.
-    pub name: &'static str,
+    pub name: Cow<'static, str>,
     /// Its default value.
     pub default: f64,
     /// The start of a fit.

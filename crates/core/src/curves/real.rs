@@ -22,6 +22,8 @@ pub trait Real:
     fn exp(self) -> Self;
     /// 1 - e^-x without cancellation.
     fn one_minus_exp(self) -> Self;
+    /// The natural logarithm.
+    fn ln(self) -> Self;
     /// ln(1 + x) without cancellation.
     fn ln_1p(self) -> Self;
     /// x^p for x > 0; 0 otherwise.
@@ -53,6 +55,9 @@ macro_rules! standard_functions {
     () => {
         fn exp(self) -> Self {
             self.exp()
+        }
+        fn ln(self) -> Self {
+            self.ln()
         }
         fn ln_1p(self) -> Self {
             self.ln_1p()
@@ -173,6 +178,9 @@ impl Real for Dual {
     }
     fn one_minus_exp(self) -> Self {
         self.chain(self.value.one_minus_exp(), (-self.value).exp())
+    }
+    fn ln(self) -> Self {
+        self.chain(self.value.ln(), 1.0 / self.value)
     }
     fn ln_1p(self) -> Self {
         self.chain(self.value.ln_1p(), 1.0 / (1.0 + self.value))

@@ -5,6 +5,7 @@
 //! scene.
 
 mod overlay;
+mod still;
 
 use crate::image::ImageFile as _;
 use std::cell::OnceCell;
@@ -78,6 +79,18 @@ impl Borders {
     /// Those of files at their full size, unsaid.
     pub fn of_files<'a>(files: impl Iterator<Item = &'a Path>, options: &LoadOptions) -> Self {
         Self::find(files.map(|file| BorderCandidate::of_file(file, |size| size)), options, &drop)
+    }
+
+    /// What stays in place in the photographs of each size, however dim it is, unsaid. Twelve of a size are decoded.
+    pub fn still_in<'a>(files: impl Iterator<Item = &'a Path>) -> Self {
+        let mut by_size: BTreeMap<(u32, u32), Vec<&Path>> = BTreeMap::new();
+        for file in files {
+            if let Ok(size) = Image::size_of(file) {
+                by_size.entry(size).or_default().push(file);
+            }
+        }
+        let found = by_size.into_iter().map(|(size, files)| (size, still_of_size(&files, size)));
+        Self(found.filter(|(_, pixels)| !pixels.is_empty()).collect())
     }
 
     /// The pixels of both.
@@ -174,6 +187,24 @@ fn hidden(
     hidden.sort_unstable();
     hidden.dedup();
     hidden
+}
+
+/// The pixels that stay in place in files of one size, from images of at most `LONGEST` pixels each way.
+fn still_of_size(files: &[&Path], (width, height): (u32, u32)) -> Vec<usize> {
+    const LONGEST: u32 = 1024;
+    let factor = width.max(height).div_ceil(LONGEST).max(1);
+    let [columns, rows] = [width, height].map(|side| side.div_ceil(factor));
+    let step = files.len().div_ceil(LOOKED_AT);
+    let plane = |file: &&Path| {
+        let image = shown(PictureFile::open(file).ok()?.reduced(|_| (columns, rows)))?;
+        Some(brightest(&image))
+    };
+    let planes: Vec<Vec<f32>> = files.iter().step_by(step).filter_map(plane).collect();
+    let grid = PixelGrid { width: columns as usize, height: rows as usize };
+    let hidden = still::still(&planes, &grid);
+    let image = Image::filled(columns, rows, [0.0; 3]);
+    let Some(mask) = Mask::hiding(&image, &hidden) else { return vec![] };
+    mask.resized(width, height).hidden()
 }
 
 /// The black border that images of one size have in common; of each, the largest channel of every pixel.

@@ -14,6 +14,11 @@ pub fn is_pattern(text: &str) -> bool {
     !text.is_empty() && Pattern::new(text).is_ok()
 }
 
+/// The pattern of a name alone.
+pub fn pattern_of(name: &str) -> String {
+    Pattern::escape(name)
+}
+
 /// The patterns of a file, one a line; empty lines and lines after # are skipped.
 pub fn patterns_of(path: &Path) -> Result<Vec<String>> {
     let text = tree::text(path)?;

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use nightsplat_core::Result;
 use nightsplat_core::camera::CameraModel;
 use nightsplat_core::hash::{self, Hasher};
+use nightsplat_core::watch::Stage;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -23,8 +24,11 @@ impl Fingerprint {
     /// Reads every pixel once.
     pub fn compute(dataset: &Dataset) -> Result<Self> {
         let views = dataset.views.par_iter().filter(|view| view.is_for_training());
-        let views = views
-            .map(|view| Ok((view.name.clone(), [camera(view), pixels(view)?].map(hash::text))));
+        let stage = Stage::begin("hashing photographs", dataset.views.len());
+        let views = views.map(|view| {
+            stage.next()?;
+            Ok((view.name.clone(), [camera(view), pixels(view)?].map(hash::text)))
+        });
         let mut points = Hasher::default();
         for point in &dataset.points {
             points.write_numbers(&point.position.to_array());

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use nightsplat_core::{Error, Result};
+use nightsplat_core::{Error, Result, input};
 
 use super::block::Block;
 use super::{Split, colmap, transforms};
@@ -44,8 +44,7 @@ impl DatasetLayout {
     /// The layout of a path that a user gives: a dataset's folder or archive, its transforms file, its COLMAP model, or
     /// a block of it.
     pub(super) fn detect(given: &Path) -> Result<Self> {
-        tree::check(given)
-            .map_err(|error| Error::input(given, format!("cannot be read: {error}")))?;
+        tree::check(given).map_err(|error| input::unreadable(given, &error))?;
         if let Some(block) = Block::at(given)? {
             let layout = Self::detect(&block.dataset)?;
             return Ok(Self { block: Some(block), ..layout });

@@ -7,6 +7,7 @@ use nightsplat_core::settings::Rule;
 use nightsplat_core::{Error, Result};
 
 use super::PixelOrientation;
+use super::shading::RowBands;
 use crate::image::{StoredLight, reduced_size};
 use crate::tree;
 use crate::white_balance::WhiteBalance;
@@ -36,6 +37,8 @@ pub struct LoadOptions {
     pub orientation: PixelOrientation,
     /// A folder of reference images by name, in place of what is found beside the input.
     pub reference: Option<PathBuf>,
+    /// A folder of targets by name, which another program made of the photographs.
+    pub targets: Option<PathBuf>,
     /// Whether test views also load their dark photograph, if any.
     pub load_low_test: bool,
     /// Number of training views, at most an eighth, that are held out to detect convergence.
@@ -53,6 +56,8 @@ pub struct LoadOptions {
     /// The fall-off of the lens: the light of the photographs is multiplied by exp(a u + b u^2), with u = 1 - cos of
     /// the angle off the axis.
     pub falloff: Option<[f64; 2]>,
+    /// Bands of rows of the photographs, which are evened out.
+    pub bands: Option<RowBands>,
     /// The size at which training photographs are measured while they are decoded, if they are not kept at that size.
     pub measured: MeasuredSize,
     /// Undistort photographs of a fisheye to a pinhole's, as for every other lens, instead of training with the fisheye
@@ -96,6 +101,7 @@ impl Default for LoadOptions {
             images: None,
             orientation: PixelOrientation::Auto,
             reference: None,
+            targets: None,
             load_low_test: true,
             hold_out: 0,
             invert_masks: false,
@@ -104,6 +110,7 @@ impl Default for LoadOptions {
             mask_overlays: true,
             white_balance: None,
             falloff: None,
+            bands: None,
             measured: MeasuredSize::default(),
             undistort: false,
             depth: DepthOptions::default(),
@@ -158,6 +165,7 @@ impl LoadOptions {
         let folders = [
             (&self.images, "photographs"),
             (&self.reference, "reference images"),
+            (&self.targets, "targets"),
             (&self.depth.folder, "depth maps"),
         ];
         for (folder, of) in folders {

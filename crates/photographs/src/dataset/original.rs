@@ -11,6 +11,7 @@ use nightsplat_core::hash::Hasher;
 use super::MeasuredSize;
 use super::packed::Packed;
 use super::prepare::Preparation;
+use super::shading::Shading;
 use super::turns::Turns;
 use crate::image::{ColourCounts, Image, Levels, Orientation, PictureFile};
 use crate::tone::MeasuredPhotograph;
@@ -34,8 +35,8 @@ pub struct Original {
     pub(super) light_size: Option<(u32, u32)>,
     /// White balance of a photograph.
     pub(super) balance: Option<WhiteBalanceMatrix>,
-    /// As [`super::LoadOptions::falloff`], of a photograph.
-    pub(super) falloff: Option<[f64; 2]>,
+    /// Shading of a photograph.
+    pub(super) shading: Shading,
     /// The statistics of the photograph, and the size they were measured at.
     pub(super) measured: Option<(MeasuredSize, MeasuredPhotograph)>,
     /// The checksum of the pixels as loaded, if they are not kept.
@@ -55,7 +56,7 @@ impl Original {
             levels: Levels::default(),
             light_size: None,
             balance: None,
-            falloff: None,
+            shading: Shading::default(),
             measured: None,
             checksum: None,
             stored: Arc::default(),
@@ -91,7 +92,7 @@ impl Original {
         if let Some(balance) = self.balance {
             balance.apply(&mut image);
         }
-        let whole = preparation.photograph(self.orientation.upright(image), path, self.falloff)?;
+        let whole = preparation.photograph(self.orientation.upright(image), path, self.shading)?;
         Ok(match self.light_size {
             Some(_) => preparation.shrunk_in_light(whole),
             None => preparation.shrunk(whole),

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use nightsplat_core::camera::{Camera, Lens};
 use nightsplat_core::hash::Hasher;
+use nightsplat_core::watch::Stage;
 use nightsplat_core::{Error, Result};
 use rayon::prelude::*;
 
@@ -19,13 +20,14 @@ use super::original::Original;
 use super::packed::Packed;
 use super::points;
 use super::prepare::{Preparation, check_size, disagreement, pixel_count};
+use super::shading::Shading;
 use super::source::{MAX_READ, ViewFiles};
 use super::tracked;
 use super::turns::{CameraPixels, ImageHeader, Turns};
 use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::image::decoded_at_once;
-use crate::image::{ColourCounts, Image, Levels, Mask, MaskFile, PictureFile};
+use crate::image::{ColourCounts, Image, Levels, Mask, MaskFile, Orientation, PictureFile};
 use crate::tone::MeasuredPhotograph;
 use crate::white_balance::WhiteBalanceMatrix;
 
@@ -118,7 +120,9 @@ fn load_with(
     let at_once = decoded_at_once(largest.max().unwrap_or_default());
     let originals = Allowance::new(bytes_for_originals(&groups, options));
     let colours = [ColourCounts::of_levels(levels), ColourCounts::new("reference image")];
+    let count = groups.iter().map(|group| group.files.len()).sum();
     let loading = Loading {
+        stage: Stage::begin("decoding photographs", count),
         options,
         at_once,
         observer,
@@ -187,6 +191,7 @@ impl LensGroup {
 
 /// What loading the views has in common.
 struct Loading<'a> {
+    stage: Stage,
     options: &'a LoadOptions,
     /// Number of photographs that are decoded concurrently.
     at_once: usize,
@@ -313,7 +318,10 @@ fn load_group(group: LensGroup, loading: &Loading<'_>) -> Result<Vec<LoadedView>
     let mut loaded = vec![];
     while !group.is_empty() {
         let now: Vec<_> = group.drain(..group.len().min(loading.at_once)).collect();
-        let now = now.into_par_iter().map(|source| views.load(source));
+        let now = now.into_par_iter().map(|source| {
+            loading.stage.next()?;
+            views.load(source)
+        });
         loaded.extend(now.collect::<Result<Vec<_>>>()?);
     }
     Ok(loaded)
@@ -370,10 +378,12 @@ impl ViewLoader<'_> {
             view_from_world,
             input,
             reference,
+            target,
             mask: mask_file,
             depth,
             read,
             turns,
+            size,
             ..
         } = source;
         let (options, [read, read_reference]) = (loading.options, read);
@@ -424,13 +434,15 @@ impl ViewLoader<'_> {
                 None => format!("{name}: no pixel is a number that its mask shows"),
             });
         }
+        let shading = Shading::new(options.falloff, options.bands.as_ref(), &name);
         let photograph = photograph
             .filter(|_| !is_hidden)
-            .map(|decoded| self.photograph(decoded, mask.as_ref(), split == Split::Train));
+            .map(|decoded| self.photograph(decoded, mask.as_ref(), shading, split == Split::Train));
         let (image, original) = photograph.transpose()?.unwrap_or_default();
         let reference =
             reference.filter(|_| !is_hidden).map(|decoded| self.reference_image(decoded));
         let (reference, reference_file) = reference.transpose()?.unwrap_or_default();
+        let target_file = target.map(|path| self.target(path, turns[0], size)).transpose()?;
         let unused = |problem| tracing::warn!("the depth of view {name} is not used: {problem}");
         let depth = depth.and_then(|path| {
             depth_map(&path, preparation, options.depth.is_disparity).map_err(unused).ok()
@@ -439,6 +451,7 @@ impl ViewLoader<'_> {
         let unit = colours.levels().unit();
         let view =
             View { orientation, original, unit, reference, reference_file, mask, depth, ..view };
+        let view = View { target_file, ..view };
         let view = (split == Split::Test || view.has_photograph()).then_some(view);
         Ok(LoadedView { name, view, problems, brightness, reference: reference_original })
     }
@@ -483,20 +496,21 @@ impl ViewLoader<'_> {
         &self,
         decoded: DecodedPicture,
         mask: Option<&Mask>,
+        shading: Shading,
         is_training: bool,
     ) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
         let mut original = decoded.original(preparation.lens, options.undistort);
         let DecodedPicture { path, image, turns, is_light, .. } = decoded;
-        let whole = preparation.photograph(turns.loading.upright(image), &path, options.falloff)?;
+        let whole = preparation.photograph(turns.loading.upright(image), &path, shading)?;
         let whole = if is_light { preparation.shrunk_in_light(whole) } else { whole };
         let is_shrunk = preparation.size != (whole.width, whole.height);
         let is_kept = options.keep != Some(0);
         if is_kept && !is_shrunk {
             return Ok((Some(whole), None));
         }
-        (original.balance, original.falloff) = (loading.balance, options.falloff);
+        (original.balance, original.shading) = (loading.balance, shading);
         original.levels = loading.colours[0].levels();
         original.light_size = is_light.then_some(preparation.size);
         let measured = |image: &Image| match mask {
@@ -524,6 +538,28 @@ impl ViewLoader<'_> {
         hasher.write(bytemuck::cast_slice(&image.data));
         original.checksum = Some(hasher);
         Ok((None, Some(original)))
+    }
+
+    /// The file of a target, which has the size of its photograph, as it is stored or turned as the camera took it.
+    fn target(&self, path: PathBuf, turns: Turns, taken: (u32, u32)) -> Result<Original> {
+        let size = PictureFile::open(&path)?.size()?;
+        let Preparation { lens, size: loaded, .. } = self.preparation;
+        let sizes = [taken, (lens.width, lens.height), loaded];
+        let loading = match [turns.loading, Orientation::UPRIGHT, turns.viewing.inverse()]
+            .into_iter()
+            .find(|turn| sizes.contains(&turn.size(size)))
+        {
+            Some(loading) => loading,
+            None => {
+                let ([width, height], [w, h]) = (<[u32; 2]>::from(size), <[u32; 2]>::from(taken));
+                let problem = format!(
+                    "is {width}x{height}, its photograph {w}x{h}; targets have the size of their photographs"
+                );
+                return Err(Error::input(path, problem));
+            }
+        };
+        let undistort = self.loading.options.undistort;
+        Ok(Original::new(path, *lens, undistort, Turns { loading, ..turns }))
     }
 
     fn reference_image(&self, decoded: DecodedPicture) -> Result<InMemory> {

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DVec3};
+use nightsplat_core::input::unreadable;
 use nightsplat_core::ply::{PlyEncoding, PlyHeader, PlyProperty, PlyScalar};
 use nightsplat_core::{Error, Result};
 
@@ -18,7 +19,7 @@ pub(super) struct Cloud {
 
 /// The finite points of a file. Normals and colours are skipped: they may come from normal-light photographs.
 pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
-    let cannot = |error| Error::input(path, format!("cannot be read: {error}"));
+    let cannot = |error| unreadable(path, &error);
     let no_points =
         |problem: &str| Error::input(path, format!("{problem}; its points are not read"));
     let header = PlyHeader::read(&mut tree::open(path).map_err(cannot)?).map_err(cannot)?;

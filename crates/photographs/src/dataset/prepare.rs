@@ -2,11 +2,12 @@
 
 use std::path::Path;
 
-use glam::{DAffine3, DVec2};
+use glam::DAffine3;
 use nightsplat_core::camera::{Camera, CameraModel, Lens};
 use nightsplat_core::{Error, Result};
 use rayon::prelude::*;
 
+use super::shading::Shading;
 use super::turns::Turns;
 use super::undistort::Undistortion;
 use crate::image::{Image, Mask, Orientation, PictureFile, linear_from_srgb, srgb_from_linear};
@@ -50,21 +51,11 @@ impl<'a> Preparation<'a> {
         Ok(self.undistorted(image))
     }
 
-    /// As [`Self::whole`], for a photograph through a lens whose light falls off.
-    pub(super) fn photograph(
-        &self,
-        image: Image,
-        path: &Path,
-        falloff: Option<[f64; 2]>,
-    ) -> Result<Image> {
+    /// As [`Self::whole`], for a photograph with this shading.
+    pub(super) fn photograph(&self, image: Image, path: &Path, shading: Shading) -> Result<Image> {
         let mut image = self.whole(image, path)?;
-        if let Some(falloff) = falloff.filter(|falloff| *falloff != [0.0; 2]) {
-            even_out(
-                &mut image,
-                &self.camera().resized(self.lens.width, self.lens.height),
-                falloff,
-            );
-        }
+        let camera = self.camera().resized(self.lens.width, self.lens.height);
+        shading.even_out(&mut image, &camera);
         Ok(image)
     }
 
@@ -131,21 +122,6 @@ impl<'a> Preparation<'a> {
         };
         let is_covered = unseen as f64 <= MOST_UNSEEN * pixel_count((width, height)) as f64;
         if is_covered { Ok(()) } else { Err(no_lens(name)) }
-    }
-}
-
-/// Undoes the fall-off of the lens, in linear light. White stays white: its light is not known.
-fn even_out(image: &mut Image, camera: &Camera, [first, second]: [f64; 2]) {
-    let pixels = image.pixel_count();
-    for index in 0..pixels {
-        let (x, y) = (index % image.width as usize, index / image.width as usize);
-        let Some(ray) = camera.in_view(DVec2::new(x as f64, y as f64) + 0.5, 1.0) else { continue };
-        let u = 1.0 - ray.z / ray.length();
-        let gain = (first * u + second * u * u).exp() as f32;
-        for value in image.data[index..].iter_mut().step_by(pixels) {
-            let evened = srgb_from_linear(gain * linear_from_srgb(*value));
-            *value = if *value < 1.0 { evened.min(1.0) } else { *value };
-        }
     }
 }
 

@@ -23,6 +23,7 @@ pub(super) struct ViewFiles {
     pub(super) view_from_world: DAffine3,
     pub(super) input: Option<PathBuf>,
     pub(super) reference: Option<PathBuf>,
+    pub(super) target: Option<PathBuf>,
     pub(super) mask: Option<MaskFile>,
     pub(super) depth: Option<PathBuf>,
     /// Photograph and reference image, if they are already read.

@@ -34,7 +34,7 @@ impl Dataset {
             hasher.write(view.as_bytes());
             hasher.write_numbers(&source.view_from_world.to_cols_array());
             let mask = source.mask.map(|mask| mask.path);
-            for file in [&source.input, &source.reference, &mask, &source.depth] {
+            for file in [&source.input, &source.reference, &source.target, &mask, &source.depth] {
                 file.iter().for_each(|path| write_file(&mut hasher, root, path));
             }
         }

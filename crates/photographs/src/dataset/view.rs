@@ -34,6 +34,8 @@ pub struct View {
     pub reference: Option<Image>,
     /// Its file, if it is not kept.
     pub reference_file: Option<Original>,
+    /// The file of its target that another program made of the photograph.
+    pub target_file: Option<Original>,
     /// The usable pixels, of the camera's size; `None` if all are usable.
     pub mask: Option<Mask>,
     /// An external depth map, (H, W) of the camera's size, in arbitrary units and with an arbitrary offset; larger is
@@ -54,6 +56,7 @@ impl View {
             unit: 1.0,
             reference: None,
             reference_file: None,
+            target_file: None,
             mask: None,
             depth: None,
         }
@@ -125,6 +128,15 @@ impl View {
     /// As [`View::loaded`].
     pub fn loaded_reference(&self) -> Result<Option<Cow<'_, Image>>> {
         self.kept_or_read(self.reference.as_ref(), self.reference_file.as_ref())
+    }
+
+    /// The target that another program made, of the photograph's size, undistorted as that is; `None` if there is none.
+    ///
+    /// # Errors
+    /// [`Error::Input`](nightsplat_core::Error::Input) if its file cannot be read.
+    #[doc(hidden)]
+    pub fn external_target(&self) -> Result<Option<Image>> {
+        self.target_file.as_ref().map(Original::load).transpose()
     }
 
     fn kept_or_read<'a>(

@@ -3,11 +3,12 @@
 #[cfg(test)]
 mod tests;
 
-use std::io::{BufReader, Cursor};
+use std::io::{BufReader, Cursor, Read as _};
 use std::path::Path;
 
 use ::image::codecs::{jpeg::JpegEncoder, png::PngEncoder};
-use ::image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader};
+use ::image::{ExtendedColorType, ImageEncoder};
+use nightsplat_core::input::unreadable;
 use nightsplat_core::output::write_whole;
 use nightsplat_core::{Error, Result};
 
@@ -16,10 +17,9 @@ use super::colour::ColourCounts;
 use super::decode::no_raw;
 use super::decode::{PictureFile, decode};
 use super::decoded::{DecodedImage, Meaning};
-use super::files::is_raw;
+use super::files::{READS_RAW, is_raw};
 use super::levels::Levels;
-use super::source::{BufReadSeek, not_an_image, reader};
-use super::{Image, Orientation, exr_file, jpeg, linear_from_srgb, png_file};
+use super::{Image, Orientation, declared, exr_file, jpeg, linear_from_srgb, png_file};
 use crate::tree;
 
 /// The bytes by which a file is told from others.
@@ -32,18 +32,30 @@ fn is_of_read_format(start: &[u8]) -> bool {
     is_webp || begins.iter().any(|magic| start.starts_with(magic))
 }
 
+/// The bytes of a file. What declares too much is refused by its header; of what is no image only the beginning is read,
+/// by which decoders refuse it, however long it is.
+fn bytes_of_image(path: &Path) -> Result<Vec<u8>> {
+    let Some(Ok(mut header)) = tree::open_header(path, START) else { return tree::bytes(path) };
+    let mut start = vec![];
+    if header.by_ref().take(START).read_to_end(&mut start).is_err() {
+        return tree::bytes(path);
+    }
+    // Of an entry of an archive, the header may be beyond what is unpacked.
+    let is_cut = start.len() as u64 == START && tree::archive_of(path).is_some();
+    let is_image = match is_raw(path) {
+        true => READS_RAW,
+        false if !is_of_read_format(&start) => false,
+        false => declared::pixels(path, BufReader::new(header))? > 0 || is_cut,
+    };
+    if is_image { tree::bytes(path) } else { Ok(start) }
+}
+
 impl PictureFile {
     /// Opens a file and reads its header.
     pub fn open(path: &Path) -> Result<Self> {
         #[cfg(debug_assertions)]
         openings::count(path);
-        // What is no image is refused by its beginning, however long it is.
-        let start = tree::start(path, START).and_then(std::io::Result::ok);
-        let bytes = match start {
-            Some(start) if !is_raw(path) && !is_of_read_format(&start) => start,
-            _ => tree::bytes(path)?,
-        };
-        Ok(Self { path: path.to_owned(), bytes, at: None })
+        Ok(Self { path: path.to_owned(), bytes: bytes_of_image(path)?, at: None })
     }
 
     /// The file, reduced while it is decoded to the size that `decoded_size` gives for its own.
@@ -64,11 +76,7 @@ impl PictureFile {
         if is_raw(&self.path) {
             return raw_size(&self.path, self.bytes.clone());
         }
-        if let Some(size) = png_file::size(&self.bytes) {
-            return Ok(size);
-        }
-        let reader = reader(Cursor::new(self.bytes.as_slice()));
-        size_of_reader(&self.path, reader.map_err(|error| unreadable(&self.path, &error))?)
+        declared::size(&self.path, Cursor::new(self.bytes.as_slice()))
     }
 
     /// Whether it holds linear light at these levels.
@@ -120,31 +128,6 @@ pub mod openings {
         let within = counts.iter().filter(|(path, _)| path.starts_with(folder));
         within.map(|(path, count)| (path.clone(), *count)).collect()
     }
-}
-
-fn file_reader(path: &Path) -> Result<ImageReader<Box<dyn BufReadSeek>>> {
-    #[cfg(debug_assertions)]
-    openings::count(path);
-    let opened = tree::open(path).and_then(|file| reader(BufReader::new(file)));
-    opened.map_err(|error| unreadable(path, &error))
-}
-
-fn unreadable(path: &Path, error: &std::io::Error) -> Error {
-    Error::input(path, format!("cannot be read: {error}"))
-}
-
-fn size_of_reader(
-    path: &Path,
-    reader: ImageReader<Box<dyn BufReadSeek + '_>>,
-) -> Result<(u32, u32)> {
-    if reader.format() != Some(ImageFormat::OpenExr) {
-        return reader.into_dimensions().map_err(|error| not_an_image(path, &error));
-    }
-    let meta = exr::meta::MetaData::read_from_buffered(reader.into_inner(), false)
-        .map_err(|error| not_an_image(path, &error))?;
-    let size = meta.headers.first().map(|header| header.layer_size);
-    let size = size.ok_or_else(|| Error::input(path, "this EXR file has no layer"))?;
-    Ok((size.width() as u32, size.height() as u32))
 }
 
 /// Images as files.
@@ -268,15 +251,10 @@ impl ImageFile for Image {
         if is_raw(path) {
             return raw_size(path, tree::bytes(path)?);
         }
-        let start = tree::start(path, START).and_then(std::io::Result::ok);
-        match png_file::size(&start.unwrap_or_default()) {
-            Some(size) => {
-                #[cfg(debug_assertions)]
-                openings::count(path);
-                Ok(size)
-            }
-            None => size_of_reader(path, file_reader(path)?),
-        }
+        #[cfg(debug_assertions)]
+        openings::count(path);
+        let file = tree::open(path).map_err(|error| unreadable(path, &error))?;
+        declared::size(path, BufReader::new(file))
     }
 
     fn save_png8(&self, path: impl AsRef<Path>) -> Result<()> {

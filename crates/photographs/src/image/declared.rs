@@ -1,38 +1,94 @@
 //! The declared size of an image, checked before memory is allocated.
 
-use std::io::Cursor;
+use std::io::{Read as _, SeekFrom};
 use std::path::Path;
 
+use nightsplat_core::input::unreadable;
 use nightsplat_core::{Error, Result};
 
 use super::budget::MAX_PIXELS;
-use super::exr_file::{self, headers, layer_bytes, size};
-use super::png_file;
-use super::source::reader;
+use super::decode::undecodable;
+use super::exr_file;
+use super::source::{BufReadSeek, not_an_image, reader};
+use super::{jpeg, png_file};
 
 /// The limit for the samples of all layers of an EXR file, which are decoded at once, bytes.
 const MAX_BYTES: u64 = 1 << 33;
+/// The limit for the bytes of a file beyond those of its decoded pixels: layers and previews of editors, clips of phones.
+const MAX_MORE: u64 = 1 << 30;
 
-/// The declared number of pixels of a file, which is within the limits; 0 if its header is not readable.
-pub(super) fn pixels(path: &Path, bytes: &[u8]) -> Result<u64> {
-    // A file without a readable header is refused by its decoder.
-    let mut count = 0;
-    let excess = if bytes.starts_with(&exr_file::MAGIC) {
-        excess_of_exr(bytes)
-    } else {
-        let of_header =
-            || reader(Cursor::new(bytes)).ok().and_then(|reader| reader.into_dimensions().ok());
-        png_file::size(bytes).or_else(of_header).and_then(|(width, height)| {
-            count = u64::from(width) * u64::from(height);
-            excess_of_size(width.into(), height.into())
-        })
-    };
-    match excess {
+/// The declared number of pixels of a file, which is within the limits, as is its length; 0 if its header is not
+/// readable: its decoder refuses it.
+pub(super) fn pixels(path: &Path, mut file: impl BufReadSeek) -> Result<u64> {
+    /// Four channels of 16 bits.
+    const BYTES_PER_PIXEL: u64 = 8;
+    let check = |excess: Option<String>| match excess {
         Some(excess) => {
             Err(Error::input(path, format!("{excess}; crop or shrink it, or copy it again")))
         }
-        None => Ok(count),
+        None => Ok(()),
+    };
+    let length = file.seek(SeekFrom::End(0)).unwrap_or_default();
+    let (count, bytes) = match layers(&mut file) {
+        Some(layers) => {
+            for [width, height] in layers.iter().map(exr_file::size) {
+                check(excess_of_size(width, height))?;
+            }
+            let bytes = exr_file::layer_bytes(&layers);
+            let is_more = bytes > MAX_BYTES;
+            let gigabytes = bytes >> 30;
+            check(is_more.then(|| format!("declares layers of {gigabytes} GiB, more than 8")))?;
+            (layers.iter().map(exr_file::size).map(|[width, height]| width * height).sum(), bytes)
+        }
+        None => {
+            let (width, height) = size(path, file).unwrap_or_default();
+            check(excess_of_size(width.into(), height.into()))?;
+            let count = u64::from(width) * u64::from(height);
+            (count, BYTES_PER_PIXEL * count)
+        }
+    };
+    let is_longer = count > 0 && length > 2 * bytes + MAX_MORE;
+    check(is_longer.then(|| format!("has {} GiB for {count} pixels", length >> 30)))?;
+    Ok(count)
+}
+
+/// Width and height of a file, from its header alone.
+pub(super) fn size(path: &Path, mut file: impl BufReadSeek) -> Result<(u32, u32)> {
+    if let Some(layers) = layers(&mut file) {
+        let first = layers.first().map(exr_file::size);
+        let [width, height] =
+            first.ok_or_else(|| Error::input(path, "this EXR file has no layer"))?;
+        return Ok((width as u32, height as u32));
     }
+    let mut start = vec![];
+    // What cannot be read is named by the reader.
+    let _ = file.rewind().and_then(|()| file.by_ref().take(32).read_to_end(&mut start));
+    if start.starts_with(&jpeg::MAGIC) {
+        return jpeg::size(&mut file).ok_or_else(|| jpeg::damaged(path));
+    }
+    if let Some(size) = png_file::size(&start) {
+        return Ok(size);
+    }
+    if start.starts_with(&exr_file::MAGIC) {
+        return Err(not_an_image(path, &std::io::Error::other("its header is damaged")));
+    }
+    let reader = file.rewind().and_then(|()| reader(file));
+    let reader = reader.map_err(|error| unreadable(path, &error))?;
+    reader.into_dimensions().map_err(|error| undecodable(path, &error))
+}
+
+/// The headers of the layers of an EXR file; `None` for other and damaged ones.
+fn layers(file: &mut impl BufReadSeek) -> Option<exr::meta::Headers> {
+    /// Attributes are read whole, and may be long.
+    const LONGEST: u64 = 1 << 22;
+    let mut start = vec![];
+    file.rewind().ok()?;
+    file.by_ref().take(4).read_to_end(&mut start).ok()?;
+    if start != exr_file::MAGIC {
+        return None;
+    }
+    file.by_ref().take(LONGEST).read_to_end(&mut start).ok()?;
+    exr_file::headers(&start)
 }
 
 fn excess_of_size(width: u64, height: u64) -> Option<String> {
@@ -40,20 +96,15 @@ fn excess_of_size(width: u64, height: u64) -> Option<String> {
     is_more.then(|| format!("declares {width}x{height}, more than 268 megapixels"))
 }
 
-fn excess_of_exr(bytes: &[u8]) -> Option<String> {
-    let headers = headers(bytes)?;
-    let too_large = headers.iter().find_map(|header| {
-        let [width, height] = size(header);
-        excess_of_size(width, height)
-    });
-    let (total, gigabytes) = (layer_bytes(bytes), layer_bytes(bytes) >> 30);
-    let is_more = total > MAX_BYTES;
-    too_large.or(is_more.then(|| format!("declares layers of {gigabytes} GiB, more than 8")))
-}
-
 #[cfg(test)]
 mod tests {
+    use std::io::Cursor;
+
     use super::*;
+
+    fn pixels(path: &Path, bytes: &[u8]) -> Result<u64> {
+        super::pixels(path, Cursor::new(bytes))
+    }
 
     /// The header of a PNG of this size, with its checksum.
     fn png(width: u32, height: u32) -> Vec<u8> {

@@ -43,7 +43,7 @@ pub(super) fn show(image: &Image, observer: RowObserver<'_>) {
 pub(super) fn decode(file: PictureFile, meaning: Meaning, levels: &Levels) -> Result<DecodedImage> {
     let PictureFile { path, bytes, at } = file;
     let path = path.as_path();
-    let pixels = declared::pixels(path, &bytes)?;
+    let pixels = declared::pixels(path, Cursor::new(bytes.as_slice()))?;
     if bytes.starts_with(&exr_file::MAGIC) {
         return Ok(exr_file::load(path, bytes, meaning, levels)?.resized_to(at));
     }
@@ -54,11 +54,12 @@ pub(super) fn decode(file: PictureFile, meaning: Meaning, levels: &Levels) -> Re
     let is_colour = meaning == Meaning::Colour;
     let converts = is_colour && !levels.are_linear();
     let converter = (converts && at.is_some()).then(|| Converter::of_file(&bytes));
-    let (mut is_beyond, mut outside) = (false, 0);
+    let (mut is_beyond, mut outside, mut converted) = (false, 0, 0);
     let mut change = |row: &mut [f32], format| {
         is_beyond |= is_colour && levels.apply_to(row, format);
         let (red, rest) = row.split_at_mut(row.len() / 3);
         let (green, blue) = rest.split_at_mut(rest.len() / 2);
+        converted += red.len();
         outside += converter.as_ref().map_or(0, |one| one.apply([red, green, blue]));
     };
     let is_light = is_colour && levels.are_linear();
@@ -74,7 +75,7 @@ pub(super) fn decode(file: PictureFile, meaning: Meaning, levels: &Levels) -> Re
     }
     let remark = if format == SampleFormat::Sixteen { one_value(extremes) } else { None };
     let conversion = match converter {
-        Some(converter) => converter.conversion(outside, pixels as usize),
+        Some(converter) => converter.conversion(outside, converted),
         None if at.is_some() => Conversion::default(),
         None => {
             is_beyond = levels.apply(&mut image, format);
@@ -185,7 +186,7 @@ fn refuse_convertible(path: &Path, bytes: &[u8]) -> Result<()> {
 }
 
 /// Distinguishes damaged files from unsupported ones, such as a TIFF of floats, which may or may not be linear light.
-fn undecodable(path: &Path, error: &ImageError) -> Error {
+pub(super) fn undecodable(path: &Path, error: &ImageError) -> Error {
     match error {
         ImageError::Unsupported(kind)
             if !matches!(kind.kind(), UnsupportedErrorKind::Format(_)) =>
@@ -221,7 +222,7 @@ impl PictureFile {
     /// RAW, which has no scale.
     pub(super) fn show_as_stored(&self, observer: RowObserver<'_>) -> Result<()> {
         let Self { path, bytes, .. } = self;
-        let pixels = declared::pixels(path, bytes)?;
+        let pixels = declared::pixels(path, Cursor::new(bytes.as_slice()))?;
         if bytes.starts_with(&exr_file::MAGIC) {
             let decoded = decode(self.clone(), Meaning::Number, &Levels::default())?;
             show(&decoded.image, observer);

@@ -26,7 +26,7 @@ pub(super) fn load(
     meaning: Meaning,
     levels: &Levels,
 ) -> Result<DecodedImage> {
-    let permit = Permit::wait(layer_bytes(&bytes));
+    let permit = Permit::wait(layer_bytes(&headers(&bytes).unwrap_or_default()));
     let (mut image, chromaticities) = decoded(path, bytes)?;
     drop(permit);
     let alpha = finite_part(&image);
@@ -123,12 +123,11 @@ pub(super) fn size(header: &ExrHeader) -> [u64; 2] {
 }
 
 /// The bytes of the samples of all layers.
-pub(super) fn layer_bytes(bytes: &[u8]) -> u64 {
+pub(super) fn layer_bytes(headers: &[ExrHeader]) -> u64 {
     let samples = |header: &ExrHeader| {
         let [width, height] = size(header);
         width.saturating_mul(height).saturating_mul(header.channels.bytes_per_pixel as u64)
     };
-    let headers = headers(bytes).unwrap_or_default();
     headers.iter().map(samples).fold(0, u64::saturating_add)
 }
 

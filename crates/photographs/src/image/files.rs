@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
-use nightsplat_core::{Error, Result};
+use nightsplat_core::{Result, input};
 use unicode_normalization::UnicodeNormalization;
 
 use crate::tree;
@@ -57,8 +57,7 @@ pub fn stem(listed: &str) -> &str {
 
 /// The photographs of a folder that can be read, by path.
 pub fn photographs_in(folder: &Path) -> Result<Vec<PathBuf>> {
-    let unreadable = |error| Error::input(folder, format!("cannot be read: {error}"));
-    let mut paths = files_in(folder).map_err(unreadable)?;
+    let mut paths = files_in(folder).map_err(|error| input::unreadable(folder, &error))?;
     paths.retain(|path| {
         let ending = path.extension().unwrap_or_default();
         is_one_of(&READABLE, &ending.to_string_lossy()) || READS_RAW && is_raw(path)

@@ -5,6 +5,7 @@
 mod structure;
 mod warnings;
 
+use std::io::SeekFrom;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
@@ -13,6 +14,7 @@ use nightsplat_core::{Error, Result};
 
 use super::levels::SampleFormat;
 use super::rows::Rows;
+use super::source::BufReadSeek;
 
 /// The magic number of JPEG files.
 pub(super) const MAGIC: [u8; 2] = [0xFF, 0xD8];
@@ -21,11 +23,51 @@ pub(super) const MAGIC: [u8; 2] = [0xFF, 0xD8];
 pub(super) fn read(path: &Path, bytes: &[u8], rows: &mut Rows<'_>) -> Result<bool> {
     // Errors of libjpeg unwind. The structure is checked first, so there should be none; this catches the rest.
     let decoded = || catch_unwind(AssertUnwindSafe(|| decode(bytes, rows))).ok()?.ok();
-    structure::is_sound(bytes).then(decoded).flatten().ok_or_else(|| {
-        let message =
-            "this JPEG is truncated, damaged or of a rare kind; copy it again or save it as PNG";
-        Error::input(path, message)
-    })
+    structure::is_sound(bytes).then(decoded).flatten().ok_or_else(|| damaged(path))
+}
+
+pub(super) fn damaged(path: &Path) -> Error {
+    let message =
+        "this JPEG is truncated, damaged or of a rare kind; copy it again or save it as PNG";
+    Error::input(path, message)
+}
+
+/// Width and height that the frame header declares, wherever it is; `None` where there is none. What precedes it is
+/// skipped, not read.
+pub(super) fn size(file: &mut impl BufReadSeek) -> Option<(u32, u32)> {
+    /// Bytes between segments, which libjpeg skips.
+    const MOST_SKIPPED: usize = 1 << 16;
+    let mut skipped = 0;
+    file.seek(SeekFrom::Start(MAGIC.len() as u64)).ok()?;
+    loop {
+        let mut marker = [0; 2];
+        file.read_exact(&mut marker).ok()?;
+        while !matches!(marker, [0xFF, 0x01..=0xFE]) {
+            skipped += 1;
+            marker[0] = marker[1];
+            file.read_exact(&mut marker[1..]).ok()?;
+            if skipped > MOST_SKIPPED {
+                return None;
+            }
+        }
+        match marker[1] {
+            0x01 | 0xD0..=0xD7 => continue,
+            // The frame header precedes the coded data and the end.
+            0xD9 | 0xDA => return None,
+            _ => {}
+        }
+        let mut length = [0; 2];
+        file.read_exact(&mut length).ok()?;
+        let rest = u16::from_be_bytes(length).checked_sub(2)?;
+        if matches!(marker[1], 0xC0..=0xCF) && !matches!(marker[1], 0xC4 | 0xC8 | 0xCC) {
+            let mut frame = [0; 5];
+            file.read_exact(&mut frame).ok()?;
+            let [_, height @ .., w, x] = frame;
+            let size = (u16::from_be_bytes([w, x]).into(), u16::from_be_bytes(height).into());
+            return Some(size).filter(|&(width, height): &(u32, u32)| width > 0 && height > 0);
+        }
+        file.seek_relative(rest.into()).ok()?;
+    }
 }
 
 /// Bytes of a pixel that libjpeg holds until an image is complete: the coefficients of a progressive one.
@@ -97,14 +139,27 @@ fn set_stored_as_seen(tiff: &mut [u8]) -> Option<()> {
     Some(())
 }
 
+/// The eighths of its size at which an image is decoded that is reduced by this factor: a smaller DCT of the low
+/// frequencies of each block. The last factor of two is left to the mean of the pixels, which keeps what rounding each
+/// to 8 bits would lose of the dark.
+fn scale(factor: u32) -> u8 {
+    match factor {
+        0..4 => 8,
+        4..8 => 4,
+        8..16 => 2,
+        16.. => 1,
+    }
+}
+
 /// Decodes a file of valid structure. Its coded data must be complete; bytes between it and the end are ignored.
 fn decode(bytes: &[u8], rows: &mut Rows<'_>) -> std::io::Result<bool> {
-    let file = Decompress::with_err(warnings::counting()).from_mem(bytes)?;
+    let mut file = Decompress::with_err(warnings::counting()).from_mem(bytes)?;
     if matches!(file.color_space(), ColorSpace::JCS_CMYK | ColorSpace::JCS_YCCK) {
         return Ok(false);
     }
     // Warnings about segments before the image do not affect its pixels.
     warnings::take();
+    file.scale(scale(rows.factor((file.width() as u32, file.height() as u32))));
     let mut file = file.rgb()?;
     let mut row = vec![0_u8; 3 * file.width()];
     rows.begin((file.width() as u32, file.height() as u32), SampleFormat::Eight, 3);
@@ -122,8 +177,8 @@ fn decode(bytes: &[u8], rows: &mut Rows<'_>) -> std::io::Result<bool> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Image;
     use super::super::rows::Destination;
+    use super::super::{Image, ImageFile as _};
     use super::*;
 
     /// Files, and the pixels that libjpeg decodes: FNV-1a of the bytes of red, green and blue.
@@ -169,6 +224,45 @@ mod tests {
         let decoded = || catch_unwind(|| decode(bytes, &mut Rows::new(Destination::Whole)));
         assert!(!is_sound || decoded().is_ok(), "{name}: {damage:x?}");
         is_sound
+    }
+
+    #[test]
+    fn a_reduced_jpeg_is_the_mean_of_its_pixels_but_for_rounding() {
+        let stored = |x: u32, y: u32| {
+            let wave = |x: u32, y: u32| 0.06 + 0.05 * f32::sin(x as f32 / 9.0 + y as f32 / 13.0);
+            [wave(x, y), wave(y, x), 0.02 + 0.04 * ((x / 16 + y / 16) % 2) as f32]
+        };
+        let bytes = Image::from_fn(320, 240, stored).to_jpeg(95).unwrap();
+        let whole = load(Path::new("a"), &bytes).unwrap().unwrap();
+        for factor in [2, 3, 4, 5, 8, 16] {
+            let (size, change) = ((320 / factor, 240 / factor), &mut |_: &mut [f32], _| ());
+            let mut rows = Rows::new(Destination::Reduced { size, is_light: false, change });
+            assert!(read(Path::new("a"), &bytes, &mut rows).unwrap());
+            let (reduced, mean) = (rows.finish().0, whole.resized(size.0, size.1));
+            let off: Vec<f32> =
+                reduced.data.iter().zip(&mean.data).map(|(a, b)| 255.0 * (a - b)).collect();
+            let count = off.len() as f32;
+            let (bias, spread) = (
+                off.iter().sum::<f32>() / count,
+                (off.iter().map(|x| x * x).sum::<f32>() / count).sqrt(),
+            );
+            assert!(bias.abs() < 0.05 && spread < 0.5, "{factor}: {bias} {spread}");
+            assert!(factor >= 4 || reduced == mean, "{factor}: as before");
+        }
+    }
+
+    #[test]
+    fn the_size_is_found_behind_any_segments_without_reading_them() {
+        let whole = fixture("420.jpg");
+        let size = |bytes: &[u8]| size(&mut std::io::Cursor::new(bytes));
+        assert_eq!(size(&whole), Some((37, 29)));
+        let long = [&[0xFF_u8, 0xE1, 0xFF, 0xFF][..], &[0; 65_533]].concat().repeat(20);
+        assert_eq!(size(&[&whole[..2], &long, &whole[2..]].concat()), Some((37, 29)));
+        assert_eq!(size(&[&whole[..2], &[0; 70_000], &whole[2..]].concat()), None);
+        let scan = whole.windows(2).position(|marker| marker == [0xFF, 0xDA]).unwrap();
+        let frame = whole.windows(2).position(|marker| marker == [0xFF, 0xC1]).unwrap();
+        assert_eq!(size(&[&whole[..frame], &whole[scan..]].concat()), None);
+        assert!((0..frame + 9).all(|length| size(&whole[..length]).is_none()));
     }
 
     #[test]

@@ -43,6 +43,16 @@ impl Orientation {
         if self.0 >= 5 { (height, width) } else { (width, height) }
     }
 
+    /// That which undoes it.
+    #[must_use]
+    pub fn inverse(self) -> Self {
+        Self(match self.0 {
+            6 => 8,
+            8 => 6,
+            other => other,
+        })
+    }
+
     /// An image as displayed.
     #[doc(hidden)]
     pub fn upright(self, image: Image) -> Image {

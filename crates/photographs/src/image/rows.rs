@@ -58,6 +58,14 @@ impl<'a> Rows<'a> {
         }
     }
 
+    /// How many pixels of an image of this size, each way, make one of the result.
+    pub(super) fn factor(&self, (width, height): (u32, u32)) -> u32 {
+        match &self.destination {
+            Destination::Reduced { size, .. } => (width / size.0).min(height / size.1),
+            _ => 1,
+        }
+    }
+
     /// Begins an image of grey (1), grey and alpha (2), RGB (3) or RGBA (4).
     pub(super) fn begin(&mut self, size: (u32, u32), format: SampleFormat, channels: usize) {
         (self.size, self.format, self.channels) = (size, format, channels);

@@ -6,13 +6,13 @@ use std::str::FromStr;
 
 use nightsplat_core::{Error, Result};
 
-use super::{Profile, Table, Tone, ToneCurve, ToneSettings};
+use super::{Profile, Table, Tone, ToneCurve, ToneSettings, is_word};
 use crate::tree;
 
-/// The value of `--curve`.
+/// The value of `--curve`, also of `--family`.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CurveChoice {
-    /// A curve of the table.
+    /// A curve of the table, or a formula of one's own.
     Named(Tone),
     /// A TOML file with settings (also a run's config.toml), or a CSV or .cube file with values.
     File(PathBuf),
@@ -30,7 +30,7 @@ impl FromStr for CurveChoice {
         }
         match text.parse() {
             Ok(curve) => Ok(Self::Named(curve)),
-            Err(error) if Tone::OF_FILES.contains(&text) => Err(error),
+            Err(error) if Tone::OF_FILES.contains(&text) || !is_word(text) => Err(error),
             Err(error) => Err(Error::Usage(format!("{error}, or a .toml, .csv or .cube file"))),
         }
     }
@@ -61,7 +61,10 @@ impl CurveChoice {
     /// The curve with the constants of its row or file.
     pub fn settings(&self) -> Result<ToneSettings> {
         match self {
-            Self::Named(curve) => Ok(ToneSettings::new(curve.clone())),
+            Self::Named(curve) => {
+                let settings = ToneSettings::new(curve.clone());
+                settings.check().map(|()| settings)
+            }
             Self::File(path) => ToneSettings::load(path),
         }
     }

@@ -40,19 +40,26 @@ impl LuminanceHistogram {
     /// The histogram of a planar (3, H, W) photograph, sRGB-encoded; NaN and negative values count as 0. An
     /// empty channel counts as the brightest.
     pub fn new(planes: &[f32]) -> Self {
+        Self::counted(planes).0
+    }
+
+    /// The histogram, and the luminance of each pixel and the sum of each channel as stored.
+    pub(super) fn counted(planes: &[f32]) -> (Self, Vec<f32>, [f64; 3]) {
         let (red, rest) = planes.split_at(planes.len() / 3);
         let planes = [red, &rest[..red.len()], &rest[red.len()..]];
-        let (histogram, sums) = Self::counted(planes);
+        let mut luminances = Vec::with_capacity(red.len());
+        let (histogram, sums) = Self::filled(planes, |luminance| luminances.push(luminance));
         let filled = filled_channels(sums);
         if filled == [0, 1, 2] {
-            return histogram;
+            return (histogram, luminances, sums);
         }
         let has_colour = filled.iter().any(|channel| *channel != filled[0]);
-        Self { has_colour, ..Self::counted(filled.map(|channel| planes[channel])).0 }
+        let (histogram, _) = Self::filled(filled.map(|channel| planes[channel]), drop);
+        (Self { has_colour, ..histogram }, luminances, sums)
     }
 
     /// The histogram of planes none of which is empty, and their sums.
-    fn counted([red, green, blue]: [&[f32]; 3]) -> (Self, [f64; 3]) {
+    fn filled([red, green, blue]: [&[f32]; 3], mut see: impl FnMut(f32)) -> (Self, [f64; 3]) {
         let mut counts = vec![0_u32; BINS];
         let (mut chroma, mut value, mut sums) = (0.0, 0.0, [0.0; 3]);
         for ((&r, &g), &b) in red.iter().zip(green).zip(blue) {
@@ -63,7 +70,9 @@ impl LuminanceHistogram {
             for (sum, x) in sums.iter_mut().zip(rgb) {
                 *sum += f64::from(x);
             }
-            let number = luminance(rgb).to_bits() >> BIN_SHIFT;
+            let y = luminance(rgb);
+            see(y);
+            let number = y.to_bits() >> BIN_SHIFT;
             let bin = number.checked_sub(FIRST_BIN);
             if let Some(count) = bin.and_then(|bin| counts.get_mut(bin as usize)) {
                 *count += 1;

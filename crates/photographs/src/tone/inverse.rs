@@ -7,6 +7,8 @@
 //! Where a curve is flat, no inverse is accurate: values within half a code of 8 bits of its maximum become those of
 //! that limit, and are counted.
 
+use std::borrow::Cow;
+
 use nightsplat_core::curves::{
     CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_TABLE, Curve, clamped, mirrored,
     shoulder, toe,
@@ -48,15 +50,17 @@ pub struct Inverted {
 impl InverseTone {
     /// The inverse of this curve with the parameters of a photograph.
     pub fn new(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {
-        let table = match &settings.curve {
-            Tone::Table(table) => Some(table.clone()),
-            Tone::Formula(_) | Tone::Auto => None,
+        let problem = match settings.curve {
             Tone::Profile(_) => {
-                let problem = "a camera profile mixes and bends channels, and has no inverse; train with a curve for \
-                           linear light";
-                return Err(Error::Usage(problem.to_owned()));
+                Some("a camera profile mixes and bends channels, and has no inverse")
             }
+            Tone::External(_) => Some("targets of another program have no curve, and no inverse"),
+            _ => None,
         };
+        if let Some(problem) = problem {
+            return Err(Error::Usage(format!("{problem}; train with a curve for linear light")));
+        }
+        let table = settings.table().map(Cow::into_owned);
         Ok(Self::of_curve(settings.curve.constant(), table, parameters))
     }
 
@@ -214,7 +218,7 @@ impl InverseTone {
 /// [`Error::Usage`] for a curve that a model cannot state.
 pub fn scene_law(settings: &ToneSettings, parameters: &ToneParameters) -> Result<SceneLaw> {
     let stops = InverseTone::new(settings, parameters)?.stops_to_target() as f32;
-    if matches!(settings.curve, Tone::Table(_)) {
+    if settings.curve.constant() == CURVE_TABLE {
         let problem =
             "a table of values is too long for a model to state; train with a named curve";
         return Err(Error::Usage(problem.to_owned()));

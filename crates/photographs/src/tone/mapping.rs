@@ -44,7 +44,8 @@ pub struct MeasuredPhotograph {
 impl MeasuredPhotograph {
     /// Measures the planes (3, pixels) of a photograph.
     pub fn measure(planes: &[f32]) -> Self {
-        let (statistics, luminance) = (Statistics::new(planes), LuminanceHistogram::new(planes));
+        let (luminance, luminances, sums) = LuminanceHistogram::counted(planes);
+        let statistics = Statistics::of_luminances(luminances, sums);
         Self { statistics, luminance, camera: None }
     }
 
@@ -141,7 +142,12 @@ impl ToneSettings {
         match &self.curve {
             Tone::Formula(curve) => curve.family().white,
             Tone::Table(table) if !table.is_of_stored => White::P90,
-            Tone::Table(_) | Tone::Auto | Tone::Profile(_) => White::One,
+            Tone::Expression(expression) if !expression.is_of_stored() => White::P90,
+            Tone::Expression(_)
+            | Tone::Table(_)
+            | Tone::Auto
+            | Tone::Profile(_)
+            | Tone::External(_) => White::One,
         }
     }
 
@@ -158,9 +164,10 @@ impl ToneSettings {
         let is_of_t = !self.curve.is_exposed();
         let t = if is_of_t { t * f64::from(statistics.p90) / f64::from(white) } else { t };
         match &self.curve {
+            Tone::Expression(expression) => clamped(expression.at(t, &padded(&self.constants))),
             Tone::Table(table) => table.value(t, 1),
             Tone::Profile(profile) => profile.value([t; 3])[1],
-            Tone::Formula(_) | Tone::Auto => {
+            Tone::Formula(_) | Tone::Auto | Tone::External(_) => {
                 let scale = [offset.into(), gain.into()];
                 let constants = padded(&self.constants);
                 clamped(curve_at(self.curve.constant(), t, scale, &constants))

@@ -1,8 +1,9 @@
 //! A curve with all its constants, as on the command line, in TOML files and in run directories.
 
 use std::any::Any;
+use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use nightsplat_core::settings::{self, Rule, Setting};
@@ -10,7 +11,7 @@ use nightsplat_core::{Error, Result};
 use serde::{Deserialize, Serialize};
 
 use super::metering::BLACK_LEVEL;
-use super::{Constant, Family, Profile, Table, Tone, ToneCurve};
+use super::{Constant, Profile, Table, Tone, ToneCurve, White};
 
 /// lambda by default: the reference images keep more of the colours than single curves do.
 const COLOUR: f64 = 1.0 / 3.0;
@@ -64,13 +65,15 @@ fn is_name(name: &str) -> bool {
 }
 
 /// Settings that belong to a curve: choosing another curve resets them.
-pub const OF_CURVE: [&str; 9] = [
+pub const OF_CURVE: [&str; 11] = [
     "gain_c",
     "alpha",
     "auto_gain",
     "colour",
     "full_resolution",
     "constants",
+    "bounds",
+    "targets",
     "table",
     "profile",
     "law",
@@ -80,9 +83,9 @@ impl ToneSettings {
     /// A row for each setting.
     #[doc(hidden)]
     pub const SETTINGS: &'static [Setting] = nightsplat_core::settings! { rows "tone."
-        /// The tone curve: a name that `nightsplat tone list` lists.
-        curve => Rule::Text("a curve that `nightsplat tone list` lists", is_name),
-           "--curve NAME|FILE";
+        /// The tone curve: a name that `nightsplat tone list` lists, or a formula of t = x / p90 or of x.
+        curve => Rule::Text("a curve that `nightsplat tone list` lists, or a formula", is_name),
+           "--curve NAME|FORMULA|FILE";
         /// c: the gain per mean luminance of the photograph.
         gain_c, "the curve's" => Rule::from_to(0.0, MOST), "--gain C|auto";
         /// Target mean of the curve linear over all channels, before clipping.
@@ -106,10 +109,14 @@ impl ToneSettings {
         full_resolution, "as auto_gain" => Rule::Flag;
         /// The constants of the curve's formula, by name.
         constants, "the curve's" => Rule::Table("a table with every constant of the curve");
+        /// The bounds of the constants of a formula of one's own in a fit, [low, high] by name.
+        bounds, "a tenth to ten times the constant" => Rule::Table("a table of [low, high]");
         /// The values of the curve `table`, read by --curve from a .csv or .cube file.
         table, "none" => Rule::Table("a table of values");
         /// The camera profile of the curve `profile`, read by --profile.
         profile, "none" => Rule::Table("a camera profile");
+        /// Folder of targets that another program made, by the names of the photographs, of the curve `targets`.
+        targets, "none" => Rule::PATH;
         /// File with the curve of every photograph, as `nightsplat blocks plan` writes it, instead of measuring them.
         law, "the photographs are measured" => Rule::PATH, "--law FILE";
     };
@@ -120,6 +127,7 @@ impl ToneSettings {
         let curve = curve.into();
         let (family, is_exposed) = (curve.family(), curve.is_exposed());
         let alpha = if curve == Tone::Auto { BLACK_LEVEL } else { 0.0 };
+        let constants = curve.constants().iter().map(|constant| constant.default).collect();
         Self {
             curve,
             gain_c: family.map_or(0.0, |family| family.gain_c),
@@ -132,7 +140,7 @@ impl ToneSettings {
             brightness: None,
             colour: COLOUR,
             full_resolution: is_exposed,
-            constants: family.map(Family::defaults).unwrap_or_default(),
+            constants,
             law: None,
         }
     }
@@ -177,8 +185,34 @@ impl ToneSettings {
         let [gain_c, theta, alpha, beta, base_gain, colour] =
             [gain_c, theta, alpha, beta, base_gain, colour].map(round);
         let brightness = self.brightness.map(round);
-        let constants = self.constants.iter().copied().map(round).collect();
+        let constants: Vec<f64> = self.constants.iter().copied().map(round).collect();
         Self { gain_c, theta, alpha, beta, base_gain, colour, brightness, constants, ..self }
+    }
+
+    /// The values that kernels interpolate, of a table or of a formula of one's own.
+    #[doc(hidden)]
+    pub fn table(&self) -> Option<Cow<'_, Table>> {
+        match &self.curve {
+            Tone::Table(table) => Some(Cow::Borrowed(table)),
+            Tone::Expression(expression) => Some(Cow::Owned(expression.table(&self.constants))),
+            Tone::Formula(_) | Tone::Auto | Tone::Profile(_) | Tone::External(_) => None,
+        }
+    }
+
+    /// The folder of targets that another program made.
+    #[doc(hidden)]
+    pub fn targets(&self) -> Option<&Path> {
+        match &self.curve {
+            Tone::External(folder) => Some(folder),
+            _ => None,
+        }
+    }
+
+    /// Whether the curve raises black by delta0.
+    #[doc(hidden)]
+    pub fn has_black_level(&self) -> bool {
+        let is_of_p90 = self.curve.family().is_some_and(|family| family.white == White::P90);
+        self.alpha > 0.0 && (is_of_p90 || self.curve == Tone::Auto)
     }
 
     /// Whether the gain follows from the photographs' [`super::Exposure`].
@@ -255,12 +289,12 @@ impl ToneSettings {
     fn check_constants(&self) -> Result<(), String> {
         let (name, family) = (self.curve.name(), self.curve.family());
         match &self.curve {
+            Tone::Expression(expression) => expression.check(&self.constants)?,
             Tone::Table(table) => table.check()?,
             Tone::Profile(profile) => profile.check()?,
-            Tone::Formula(_) | Tone::Auto => {}
+            Tone::Formula(_) | Tone::Auto | Tone::External(_) => {}
         }
-        let (given, needed) =
-            (self.constants.len(), family.map_or(0, |family| family.constants.len()));
+        let (given, needed) = (self.constants.len(), self.curve.constants().len());
         if given != needed {
             return Err(format!("the curve `{name}` has {needed} constants, not {given}"));
         }
@@ -334,9 +368,13 @@ struct SerializedToneSettings {
     #[serde(skip_serializing_if = "Option::is_none")]
     constants: Option<BTreeMap<String, f64>>,
     #[serde(skip_serializing_if = "Option::is_none")]
+    bounds: Option<BTreeMap<String, [f64; 2]>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     table: Option<Table>,
     #[serde(skip_serializing_if = "Option::is_none")]
     profile: Option<Profile>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    targets: Option<PathBuf>,
     #[serde(skip_serializing_if = "Option::is_none")]
     law: Option<PathBuf>,
 }
@@ -361,34 +399,49 @@ fn written_curve(
     Err(format!("the curve `{}` {problem}", name.unwrap_or_default()))
 }
 
+/// The constants of a curve in the order of its formula. Those of a formula of one's own may state values already.
+fn constants_of(curve: &Tone, mut values: BTreeMap<String, f64>) -> Result<Vec<f64>, String> {
+    let (name, formula) = (curve.name(), curve.formula());
+    let is_own = matches!(curve, Tone::Expression(_));
+    let value = |constant: &Constant| {
+        let value = values.remove(constant.name.as_ref());
+        value.or(is_own.then_some(constant.default)).ok_or_else(|| {
+            let missing = &constant.name;
+            format!("the curve `{name}` needs the constant `{missing}`; its formula is {formula}")
+        })
+    };
+    let constants = curve.constants().iter().map(value).collect::<Result<_, _>>()?;
+    match values.keys().next() {
+        Some(other) => {
+            Err(format!("the curve `{name}` has no constant `{other}`; its formula is {formula}"))
+        }
+        None => Ok(constants),
+    }
+}
+
 impl TryFrom<SerializedToneSettings> for ToneSettings {
     type Error = String;
 
     fn try_from(written: SerializedToneSettings) -> Result<Self, String> {
-        let defaults = Self::new(written_curve(written.curve, written.table, written.profile)?);
-        let (name, family) = (defaults.curve.name(), defaults.curve.family());
-        let constants = match written.constants {
-            None => defaults.constants,
-            Some(mut values) => {
-                let known = family.map_or(&[][..], |family| family.constants);
-                let formula = family.map_or("none", |family| family.formula);
-                let value = |constant: &Constant| {
-                    values.remove(constant.name).ok_or_else(|| {
-                        let missing = constant.name;
-                        format!(
-                            "the curve `{name}` needs the constant `{missing}`; its formula is {formula}"
-                        )
-                    })
-                };
-                let constants = known.iter().map(value).collect::<Result<_, _>>()?;
-                if let Some(other) = values.keys().next() {
-                    return Err(format!(
-                        "the curve `{name}` has no constant `{other}`; its formula is {formula}"
-                    ));
-                }
-                constants
-            }
+        let mut curve = match (written.curve.as_deref(), written.targets) {
+            (None | Some("targets"), Some(folder)) => Tone::External(folder),
+            (Some(name), Some(_)) => return Err(format!("the curve `{name}` takes no targets")),
+            (_, None) => written_curve(written.curve, written.table, written.profile)?,
         };
+        let constants = match written.constants {
+            Some(values) => constants_of(&curve, values)?,
+            None => curve.constants().iter().map(|constant| constant.default).collect(),
+        };
+        match &mut curve {
+            Tone::Expression(expression) => {
+                *expression = expression.with(&constants, &written.bounds.unwrap_or_default())?;
+            }
+            _ if written.bounds.is_some() => {
+                return Err(format!("the curve `{curve}` takes no bounds; its row has them"));
+            }
+            _ => {}
+        }
+        let defaults = Self::new(curve);
         let auto_gain = written.auto_gain.unwrap_or(defaults.auto_gain);
         let settings = Self {
             curve: defaults.curve,
@@ -412,15 +465,20 @@ impl TryFrom<SerializedToneSettings> for ToneSettings {
 
 impl From<ToneSettings> for SerializedToneSettings {
     fn from(settings: ToneSettings) -> Self {
-        let known = settings.curve.family().map_or(&[][..], |family| family.constants);
-        let names = known.iter().map(|constant| constant.name.to_owned());
+        let names = settings.curve.constants().iter().map(|constant| constant.name.to_string());
         let constants: BTreeMap<String, f64> = names.zip(settings.constants).collect();
         let name = settings.curve.name().to_owned();
-        let (table, profile) = match settings.curve {
-            Tone::Table(table) => (Some(table), None),
-            Tone::Profile(profile) => (None, Some(profile)),
-            Tone::Formula(_) | Tone::Auto => (None, None),
-        };
+        let (mut bounds, mut table, mut profile, mut targets) = (None, None, None, None);
+        match settings.curve {
+            Tone::Expression(expression) => {
+                let constants = expression.constants().iter();
+                bounds = Some(constants.map(|one| (one.name.to_string(), one.bounds)).collect());
+            }
+            Tone::Table(of_file) => table = Some(of_file),
+            Tone::Profile(of_file) => profile = Some(of_file),
+            Tone::External(folder) => targets = Some(folder),
+            Tone::Formula(_) | Tone::Auto => {}
+        }
         Self {
             curve: Some(name),
             gain_c: Some(settings.gain_c),
@@ -434,8 +492,10 @@ impl From<ToneSettings> for SerializedToneSettings {
             colour: Some(settings.colour),
             full_resolution: Some(settings.full_resolution),
             constants: Some(constants).filter(|constants| !constants.is_empty()),
+            bounds: bounds.filter(|bounds: &BTreeMap<_, _>| !bounds.is_empty()),
             table,
             profile,
+            targets,
             law: settings.law,
         }
     }

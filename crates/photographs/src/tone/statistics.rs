@@ -36,6 +36,11 @@ impl Statistics {
                 *sum += f64::from(x);
             }
         }
+        Self::of_luminances(luminances, sums)
+    }
+
+    /// The statistics of pixels with these luminances and sums of the channels.
+    pub(super) fn of_luminances(mut luminances: Vec<f32>, sums: [f64; 3]) -> Self {
         let [red, green, blue] = sums.map(|sum| sum / luminances.len().max(1) as f64);
         let [p10, p80, p90] = percentiles(&mut luminances, [1, 8, 9]).map(|value| value + EPSILON);
         Self {

@@ -1,18 +1,21 @@
-//! The page of `tone apply`: measurements, histograms of luminance, images side by side.
+//! The page of `tone apply`: all photographs dark and lit, measurements, histograms of luminance.
 
 use std::path::Path;
 
+use nightsplat_core::natural;
 use nightsplat_core::output::write_whole;
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::metrics::Scores;
+use nightsplat_photographs::tone::Tone;
 
 use super::photographs::InputPhotograph;
-use super::{ApplyArgs, CurveOnSet, Mapped, Measures, ToneOutput, without};
+use super::{ApplyArgs, CurveOnSet, Mapped, Measures, ToneOutput, ToneReport, without};
 use crate::Result;
 use crate::gpu::Gpu;
 use crate::results::eval;
 use crate::results::report::{
-    Best, Column, Comparison, Distribution, NumberTable, Picture, Report, distributions,
+    Best, Column, Comparison, ContactSheet, Distribution, NumberTable, Picture, Report,
+    distributions,
 };
 
 /// Maximum width of an image, pixels.
@@ -27,7 +30,12 @@ pub(super) struct TonePage {
     result: Distribution,
     compared: Vec<(CurveOnSet, Distribution)>,
     reference: Distribution,
+    /// All photographs, dark and lit.
+    sheet: ContactSheet,
+    /// The first with every curve.
     comparison: Option<Comparison>,
+    /// The number of photographs so far.
+    count: usize,
 }
 
 impl TonePage {
@@ -49,12 +57,14 @@ impl TonePage {
             result: Distribution::new(curve.clone()),
             compared: compared.collect::<Result<_>>()?,
             reference: Distribution::new("reference"),
+            sheet: ContactSheet::new("The photographs, dark and lit", photographs.len()),
             comparison: None,
+            count: 0,
             curve,
         })
     }
 
-    /// Adds a photograph and its result; the images of the first are shown.
+    /// Adds a photograph and its result; the first is shown large.
     pub(super) fn add(
         &mut self,
         listed: &InputPhotograph,
@@ -62,6 +72,10 @@ impl TonePage {
         scores: Option<Scores>,
     ) -> Result<()> {
         let Mapped { photograph, gaps, image, reference, .. } = mapped;
+        if self.sheet.shows(self.count, "") {
+            self.sheet.add(&listed.name, "", [photograph, image]);
+        }
+        self.count += 1;
         if self.only_referenced && reference.is_none() {
             return Ok(());
         }
@@ -70,7 +84,7 @@ impl TonePage {
         let mut pictures =
             vec![picture("photograph", None, photograph), picture(&self.curve, scores, image)];
         for (set, distribution) in &mut self.compared {
-            let (_, image, _) = set.result(photograph, gaps, true)?;
+            let (_, image, _) = set.result(photograph, gaps, listed)?;
             distribution.add(&without(&image, gaps));
             let scores = reference.as_ref().map(|reference| Scores::measure(&image, reference));
             pictures.push(picture(&distribution.name, scores.transpose()?, &image));
@@ -94,7 +108,9 @@ impl TonePage {
         )];
         if self.only_referenced {
             drawn.push(self.reference);
-            intro.push("Histograms and images show photographs with a reference only.".to_owned());
+            intro.push(
+                "Histograms and the large images are of photographs with a reference.".to_owned(),
+            );
         }
         intro.extend(output.with_reference.as_deref().map(eval::with_reference));
         let report = Report {
@@ -102,6 +118,7 @@ impl TonePage {
             intro,
             tables: vec![table(output)],
             charts: vec![distributions(&drawn)],
+            sheets: vec![self.sheet],
             comparisons: self.comparison.into_iter().collect(),
             ..Report::default()
         };
@@ -114,26 +131,32 @@ fn picture(caption: &str, scores: Option<Scores>, image: &Image) -> Picture {
     Picture::shrunk(caption, scores.unwrap_or_default(), image, PICTURE_WIDTH)
 }
 
-fn table(output: &ToneOutput) -> NumberTable {
+/// Measurements of the photographs in the order of their names, then of the scene; without what no photograph has, and
+/// without what the curve does not use.
+pub(super) fn table(output: &ToneOutput) -> NumberTable {
     let column =
         |name: &str, digits| Column { name: name.to_owned(), digits, best: Best::Unmarked };
     let measured = |Measures { mean_luminance, near_white_fraction, skewness, .. }: Measures| {
         [Some(mean_luminance), Some(skewness), Some(100.0 * near_white_fraction)]
     };
-    let views = output.views.iter().map(|(name, report)| (name.clone(), *report));
-    let rows = views.chain([("scene".to_owned(), output.scene)]).map(|(name, report)| {
-        let before = report.before;
-        let mut values =
-            vec![Some(before.p10), Some(before.p90), Some(before.r), Some(report.delta0)];
-        values.extend(measured(before));
-        values.extend(measured(report.after));
-        values.extend([
-            report.scores.map(|scores| scores.psnr),
-            report.scores.map(|scores| scores.ssim),
-        ]);
-        (name, values)
+    // The black level of the curve auto does not depend on the photograph.
+    let has_black_level = output.curve.has_black_level() && output.curve.curve != Tone::Auto;
+    let mut views: Vec<(&str, &ToneReport)> =
+        output.views.iter().map(|(name, report)| (name.as_str(), report)).collect();
+    views.sort_by(|a, b| natural::compare(a.0, b.0));
+    let rows = views.into_iter().chain([("scene", &output.scene)]).map(|(name, report)| {
+        let ToneReport { before, delta0, after, gain, scores, .. } = report;
+        let of_black_level =
+            [Some(before.r), *delta0].map(|value| value.filter(|_| has_black_level));
+        let mut values = vec![Some(before.p10), Some(before.p90)];
+        values.extend(of_black_level);
+        values.push(*gain);
+        values.extend(measured(*before));
+        values.extend(measured(*after));
+        values.extend([scores.map(|scores| scores.psnr), scores.map(|scores| scores.ssim)]);
+        (name.to_owned(), values)
     });
-    NumberTable {
+    let table = NumberTable {
         title: "Per photograph, and means of the scene".to_owned(),
         label: "photograph".to_owned(),
         columns: vec![
@@ -141,15 +164,18 @@ fn table(output: &ToneOutput) -> NumberTable {
             column("p90", 4),
             column("r", 3),
             column("delta0", 4),
-            column("mean Y", 4),
+            column("gain", 1),
+            column("Y", 4),
             column("skewness", 2),
-            column("near white, %", 1),
-            column("mean Y after", 4),
-            column("skewness after", 2),
-            column("near white after, %", 1),
+            column("white %", 1),
+            column("lit Y", 4),
+            column("lit skewness", 2),
+            column("lit white %", 1),
             column("PSNR, dB", 2),
             column("SSIM", 3),
         ],
         rows: rows.collect(),
-    }
+        ..NumberTable::default()
+    };
+    table.without_empty_columns()
 }

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use nightsplat_core::input::unreadable;
 use nightsplat_core::output::is_same_file;
 use nightsplat_photographs::dataset::{Borders, Dataset, LoadOptions, Photograph, Split};
 use nightsplat_photographs::image::files::{photographs_in, unread_in};
@@ -85,9 +86,7 @@ impl InputPhotograph {
 /// The photographs of the input: a file, those of a folder by name, or those of a dataset.
 pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<InputPhotograph>> {
     let input = &args.input;
-    let unreadable =
-        |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));
-    std::fs::metadata(input).map_err(unreadable)?;
+    std::fs::metadata(input).map_err(|error| unreadable(input, &error))?;
     let is_reduced = args.out.is_none();
     let mut photographs = if !tree::is_dir(input) {
         vec![plain(input, args.reference.as_deref())?]

@@ -47,10 +47,9 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
     let statistics: Vec<Statistics> = pairs.iter().map(|pair| pair.statistics).collect();
     let statistics = Statistics::mean_of(&statistics).unwrap_or_default();
     let curve = |name: &str, settings: &ToneSettings| {
-        let parameters = settings.parameters(&statistics);
         let point = |i: usize| {
             let t = end * i as f64 / (POINTS - 1) as f64;
-            (t, f64::from(settings.curve.apply(t as f32 * statistics.p90, &parameters)))
+            (t, settings.value(t, &statistics))
         };
         let points = (0..POINTS).map(point).collect();
         Series { name: name.to_owned(), points, ..Series::default() }

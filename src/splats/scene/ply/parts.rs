@@ -4,10 +4,11 @@ use std::fs::File;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
+use nightsplat_core::input::unreadable;
 use nightsplat_core::output::write_whole_with;
 use nightsplat_core::ply::{PlyEncoding, PlyHeader};
 
-use super::{PlyLayout, Writer, comment_lines};
+use super::{PlyLayout, Writer, comment_lines, unusable};
 use crate::splats::scene::{Gaussians, ModelFacts, Shape};
 use crate::{Error, Result};
 
@@ -28,21 +29,23 @@ impl PartFile {
     /// Opens a binary PLY in the INRIA layout; `None` for a file of another kind, and for what is not read twice, such
     /// as a pipe.
     pub(crate) fn open(path: &Path, part: usize) -> Result<Option<Self>> {
-        let cannot = |error: std::io::Error| Error::input(path, format!("cannot be read: {error}"));
+        let cannot = |error: std::io::Error| unreadable(path, &error);
         if !path.is_file() {
             return Ok(None);
         }
         let mut file = File::open(path).map_err(cannot)?;
         let length = file.metadata().map_err(cannot)?.len();
         let header = match PlyHeader::read(&mut file).map_err(cannot)? {
-            Some(header) => header.map_err(|problem| Error::input(path, problem))?,
+            Some(header) => header.map_err(|problem| unusable(path, &problem))?,
             None => return Ok(None),
         };
         if header.encoding == PlyEncoding::Text {
             return Ok(None);
         }
-        let layout = PlyLayout::new(&header, length - header.length as u64);
-        let layout = layout.map_err(|problem| Error::input(path, problem))?;
+        // It may have changed since.
+        let length = length.saturating_sub(header.length as u64);
+        let layout = PlyLayout::new(&header, length);
+        let layout = layout.map_err(|problem| unusable(path, &problem))?;
         Ok(Some(Self { path: path.to_owned(), file, layout, part }))
     }
 
@@ -59,11 +62,20 @@ impl PartFile {
         self.layout.shape
     }
 
+    /// All Gaussians; their numbers may be infinite or NaN.
+    pub(crate) fn whole(self) -> Result<Gaussians> {
+        let mut whole = self.layout.gaussians(&[]);
+        Self { part: usize::MAX, ..self }.read(|part| {
+            whole = part;
+            Ok(())
+        })?;
+        Ok(whole)
+    }
+
     /// All Gaussians, a part at a time and in order. Their numbers may be infinite or NaN.
     pub(crate) fn read(&self, mut take: impl FnMut(Gaussians) -> Result<()>) -> Result<()> {
         let PlyLayout { count, stride, length, .. } = self.layout;
-        let cannot =
-            |error: std::io::Error| Error::input(&self.path, format!("cannot be read: {error}"));
+        let cannot = |error: std::io::Error| unreadable(&self.path, &error);
         let mut file = &self.file;
         file.seek(SeekFrom::Start(length as u64)).map_err(cannot)?;
         let mut vertices = vec![];

@@ -7,6 +7,7 @@
 //!
 //! Robust least squares, as for a lamp, but k2 may be negative: the light of a wide aperture falls fastest halfway.
 
+use rayon::prelude::*;
 use serde::Serialize;
 
 use super::fit::LampObservations;
@@ -30,7 +31,7 @@ pub struct FalloffDiagnosis {
     pub falloff: [f64; 2],
     /// The light at the farthest corner.
     pub corner: f64,
-    /// Its standard error, stops.
+    /// Its standard error, stops; that of dark corners alone is measured, others have 0.
     pub error: f64,
     /// Whether points are seen far enough off the axis, and the light falls all the way.
     pub is_reached: bool,
@@ -40,12 +41,13 @@ pub struct FalloffDiagnosis {
 
 impl FalloffDiagnosis {
     /// Measures observations; `corner` is u at the corner that is farthest from the axis.
-    pub(in super::super) fn new(rows: &LampObservations, corner: f64) -> Self {
+    pub(super) fn new(rows: &LampObservations, corner: f64) -> Self {
         let stops = |[first, second]: [f64; 2]| first * corner + second * corner * corner;
         let falloff = rows.fit_falloff();
+        let measured = if (-stops(falloff)).exp2() < MAX_CORNER { FOLDS } else { 0 };
         let without = |fold: usize| stops(rows.part(|group| group % FOLDS != fold).fit_falloff());
-        let folds: Vec<f64> = (0..FOLDS).map(without).collect();
-        let mean = folds.iter().sum::<f64>() / FOLDS as f64;
+        let folds: Vec<f64> = (0..measured).into_par_iter().map(without).collect();
+        let mean = folds.iter().sum::<f64>() / folds.len().max(1) as f64;
         let squares = folds.iter().map(|fold| (fold - mean).powi(2)).sum::<f64>();
         Self {
             falloff: falloff.map(|stops| stops * std::f64::consts::LN_2),
@@ -66,11 +68,15 @@ impl FalloffDiagnosis {
 
     /// The measurement in a line.
     pub fn why(&self) -> String {
-        let reach = if self.is_reached { "" } else { ", extrapolated" };
+        let Self { corner, error, is_reached, .. } = self;
+        let reach = if *is_reached { "" } else { ", extrapolated" };
+        let error = match *error {
+            0.0 => String::new(),
+            stops => format!(", give or take {stops:.2} stops"),
+        };
         format!(
-            "the corners of the photographs have {:.2} of the light of the middle, give or take {:.2} stops{reach} \
-             (threshold {MAX_CORNER})",
-            self.corner, self.error
+            "the corners of the photographs have {corner:.2} of the light of the middle{error}{reach} (threshold \
+             {MAX_CORNER})"
         )
     }
 }

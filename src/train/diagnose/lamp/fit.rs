@@ -84,6 +84,17 @@ impl LampObservations {
         Ok(rows)
     }
 
+    /// With a column, of values in stops, taken from the brightness.
+    pub(super) fn without(mut self, column: &[f64]) -> Self {
+        self.light.iter_mut().zip(column).for_each(|(light, value)| *light -= value);
+        self
+    }
+
+    /// log2 of exp(-a u - b u^2) in each observation.
+    pub(super) fn fall(&self, [a, b]: [f64; 2]) -> Vec<f64> {
+        self.off_axis.iter().map(|u| -(a * u + b * u * u) / LN_2).collect()
+    }
+
     /// Refuses points whose distances from their cameras hardly differ.
     pub(super) fn check_distances(&self) -> Result<(), String> {
         let spread = trimmed_variance(self.less_point(self.distance.clone())).sqrt();

@@ -199,3 +199,28 @@ fn a_failed_write_leaves_no_file() {
     );
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
 }
+
+#[test]
+fn a_file_of_any_length_is_refused_by_its_header() {
+    let (path, _folder) = file("a.png");
+    Image::filled(16, 16, [0.5; 3]).save_png8(&path).unwrap();
+    let png = std::fs::read(&path).unwrap();
+    let mut bomb = png.clone();
+    bomb[16..24].copy_from_slice(&[0, 0, 0x4E, 0x20, 0, 0, 0x4E, 0x20]);
+    for (start, part) in [
+        (&bomb[..], "declares 20000x20000"),
+        (&png[..], "has 8192 GiB for 256 pixels"),
+        (&b"\xFF\xD8\xFF"[..], "this JPEG is truncated"),
+        (&exr_file::MAGIC[..], "is not a readable"),
+        (&b"II*\0"[..], "is not a readable"),
+        (&b"RIFF\0\0\0\0WEBPVP8 "[..], "is not a readable"),
+        (&b"no image"[..], "is not a readable"),
+    ] {
+        std::fs::write(&path, start).unwrap();
+        // More than there is memory.
+        std::fs::File::options().write(true).open(&path).unwrap().set_len(1 << 43).unwrap();
+        let message = Image::load(&path).unwrap_err().to_string();
+        assert!(message.contains(part), "{part}: {message}");
+        assert!(Image::size_of(&path).is_err() || part.contains("pixels") || start == bomb);
+    }
+}

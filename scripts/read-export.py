@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
-"""Reads a run's model.glb with pygltflib and compares every number with model.ply, read by plyfile.
+"""Reads a run's exports with other libraries and compares every number with model.ply, read by plyfile.
 
-    python3 -m venv env && env/bin/pip install numpy plyfile pygltflib
-    nightsplat export RUN --format glb && env/bin/python scripts/read-glb.py RUN
+    python3 -m venv env && env/bin/pip install numpy plyfile pygltflib usd-core
+    nightsplat export RUN --format glb && env/bin/python scripts/read-export.py RUN/model.glb
+    nightsplat export RUN --format usda && env/bin/python scripts/read-export.py RUN/model.usda
 
-glTF has y up: positions, rotations and the directions of SH are rotated by half a turn about x.
+model.ply lies beside the export, or is the second argument. glTF and USD have y up: positions, rotations and the
+directions of SH are rotated by half a turn about x. Runs whose up direction is not -y need `--up none`.
 """
 
 import pathlib
@@ -12,13 +14,14 @@ import sys
 
 import numpy as np
 from plyfile import PlyData
-from pygltflib import GLTF2
 
 EXTENSION = "KHR_gaussian_splatting"
 
 
 def read_glb(path):
-    """The attributes of the one primitive, as the accessors describe them."""
+    """The attributes of the one primitive, as the accessors describe them, by pygltflib."""
+    from pygltflib import GLTF2
+
     gltf = GLTF2.load(str(path))
     assert EXTENSION in gltf.extensionsUsed
     (mesh,) = gltf.meshes
@@ -35,7 +38,45 @@ def read_glb(path):
         begin = (view.byteOffset or 0) + (accessor.byteOffset or 0)
         values = np.frombuffer(body, "<f4", accessor.count * width, begin).reshape(-1, width)
         found[name.removeprefix(EXTENSION + ":")] = values.astype(np.float64)
-    return found
+    degrees = sorted(name for name in found if name.startswith("SH_DEGREE_"))
+    return {
+        "positions": found["POSITION"],
+        "rotations": found["ROTATION"][:, [3, 0, 1, 2]],
+        "scales": found["SCALE"],
+        "opacities": found["OPACITY"],
+        "sh": np.stack([found[name] for name in degrees], axis=1),
+    }
+
+
+def read_usd(path):
+    """The attributes of the default prim by usd-core, after its own checks of the stage."""
+    from pxr import Usd, UsdGeom, UsdValidation, UsdVol
+
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
+    prim = stage.GetDefaultPrim()
+    splats = UsdVol.ParticleField3DGaussianSplat(prim)
+    assert splats and prim.IsA(UsdVol.ParticleField) and prim.HasAPI(UsdVol.ParticleFieldKernelGaussianEllipsoidAPI)
+    declared = prim.GetPrimDefinition().GetPropertyNames()
+    foreign = [name for name in prim.GetAuthoredPropertyNames() if name not in declared]
+    assert not foreign, f"the schema has no {foreign}"
+    registry = UsdValidation.ValidationRegistry()
+    problems = UsdValidation.ValidationContext(registry.GetOrLoadAllValidators()).Validate(stage)
+    assert not problems, [problem.GetMessage() for problem in problems]
+    print(f"ok  schema and {len(registry.GetOrLoadAllValidators())} validators")
+    get = lambda name: np.array(prim.GetAttribute(name).Get(), dtype=np.float64)
+    positions, quats = get("positions"), prim.GetAttribute("orientations").Get()
+    degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
+    sh = get("radiance:sphericalHarmonicsCoefficients").reshape(len(positions), (degree + 1) ** 2, 3)
+    low, high = get("extent")
+    assert np.all(low <= positions.min(axis=0)) and np.all(positions.max(axis=0) <= high)
+    return {
+        "positions": positions,
+        "rotations": np.array([[quat.GetReal(), *quat.GetImaginary()] for quat in quats]),
+        "scales": get("scales"),
+        "opacities": get("opacities")[:, None],
+        "sh": sh,
+    }
 
 
 def read_ply(path):
@@ -86,35 +127,35 @@ def basis(direction, count):
 
 
 def main():
-    run = pathlib.Path(sys.argv[1])
-    glb, ply = read_glb(run / "model.glb"), read_ply(run / "model.ply")
+    path = pathlib.Path(sys.argv[1])
+    read = read_glb(path) if path.suffix == ".glb" else read_usd(path)
+    ply = read_ply(sys.argv[2] if len(sys.argv) > 2 else path.with_name("model.ply"))
     turn = np.array([1.0, -1.0, -1.0])
     # Axes may point either way, so rotations and scales are compared as covariances.
     ply_covariances = covariances(ply["rotations"], ply["scales"]) * np.outer(turn, turn)
-    glb_covariances = covariances(glb["ROTATION"][:, [3, 0, 1, 2]], glb["SCALE"])
+    read_covariances = covariances(read["rotations"], read["scales"])
     sizes = np.max(ply["scales"], axis=1)[:, None, None] ** 2
 
     count = ply["sh"].shape[1]
     degree = int(np.sqrt(count)) - 1
-    names = [f"SH_DEGREE_{l}_COEF_{k}" for l in range(degree + 1) for k in range(2 * l + 1)]
-    sh = np.stack([glb[name] for name in names], axis=1)
     direction = np.array([0.48, -0.6, 0.64])
-    colors = [np.einsum("k,nkc->nc", basis(d, count), of) for d, of in ((direction, ply["sh"]), (turn * direction, sh))]
+    seen = ((direction, ply["sh"]), (turn * direction, read["sh"]))
+    colors = [np.einsum("k,nkc->nc", basis(d, count), of) for d, of in seen]
 
     pairs = {
-        "positions": (glb["POSITION"], ply["positions"] * turn),
-        "scales": (glb["SCALE"], ply["scales"]),
-        "opacities": (glb["OPACITY"], ply["opacities"]),
-        "covariances": (glb_covariances / sizes, ply_covariances / sizes),
+        "positions": (read["positions"], ply["positions"] * turn),
+        "scales": (read["scales"], ply["scales"]),
+        "opacities": (read["opacities"], ply["opacities"]),
+        "covariances": (read_covariances / sizes, ply_covariances / sizes),
         f"colours of degree {degree} from a direction": (colors[1], colors[0]),
     }
     failed = 0
-    for name, (read, wanted) in pairs.items():
-        assert read.shape == wanted.shape, name
-        error = np.max(np.abs(read - wanted) / (1e-2 + np.abs(wanted)))
+    for name, (found, wanted) in pairs.items():
+        assert found.shape == wanted.shape, name
+        error = np.max(np.abs(found - wanted) / (1e-2 + np.abs(wanted)))
         print(f"{'ok' if error < 1e-4 else 'BAD':3} {name}: relative error {error:.1e} at most")
         failed += not error < 1e-4
-    print(f"{len(glb['POSITION'])} Gaussians")
+    print(f"{len(read['positions'])} Gaussians")
     return int(failed > 0)
 
 
