@@ -12,7 +12,7 @@ const NEIGHBOURS: f64 = 10.0;
 /// Processor seconds of a megapixel's features, of a pair of photographs, and of a camera, measured with COLMAP 3.8 on
 /// processors. Photographs above the size to which COLMAP shrinks them take no longer.
 const FEATURES: f64 = 2.0;
-const PAIR: f64 = 0.15;
+const PAIR: f64 = 0.3;
 const CAMERA: f64 = 0.6;
 const LARGEST: f64 = 3200.0 * 2400.0;
 

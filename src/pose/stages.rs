@@ -13,13 +13,15 @@ pub(super) struct StageProgress<'a> {
     photographs: usize,
     begin: Instant,
     last: Instant,
+    /// The first count, which an earlier call may have reached.
+    first: Option<usize>,
 }
 
 impl<'a> StageProgress<'a> {
     /// Starts a stage on this number of photographs; `what` begins its lines.
     pub(super) fn new(what: &'a str, photographs: usize) -> Self {
         let now = Instant::now();
-        Self { what, photographs, begin: now, last: now }
+        Self { what, photographs, begin: now, last: now, first: None }
     }
 
     /// The next line if it is due, from the output so far.
@@ -30,9 +32,10 @@ impl<'a> StageProgress<'a> {
         self.last = Instant::now();
         let how_far = match counted(printed, self.photographs) {
             Some([at, of]) => {
-                let left = self.begin.elapsed().as_secs_f64() * (of - at) as f64 / at.max(1) as f64;
-                let left = if at > 0 { format!(", {} left", about(left)) } else { String::new() };
-                format!("{at} of {of}{left}")
+                let done = at.saturating_sub(*self.first.get_or_insert(at));
+                let left = self.begin.elapsed().as_secs_f64() * (of - at) as f64 / done as f64;
+                let left = (done > 0).then(|| format!(", {} left", about(left)));
+                format!("{at} of {of}{}", left.unwrap_or_default())
             }
             None => "at work".to_owned(),
         };
@@ -115,9 +118,11 @@ mod tests {
         let mut stage = StageProgress::new("matching", 24);
         assert_eq!(stage.due("Matching block [1/1, 1/1]"), None, "too early");
         stage.last = Instant::now().checked_sub(INTERVAL).unwrap();
-        stage.begin = Instant::now().checked_sub(Duration::from_secs(40)).unwrap();
-        let line = "matching: 1 of 4, about 2 min left";
-        assert_eq!(stage.due("Matching block [1/2, 1/2]").unwrap(), line);
+        stage.begin = Instant::now().checked_sub(Duration::from_secs(35)).unwrap();
+        assert_eq!(stage.due("Matching block [1/2, 1/2]").unwrap(), "matching: 1 of 4");
+        stage.last = Instant::now().checked_sub(INTERVAL).unwrap();
+        let line = "matching: 2 of 4, about 80 s left";
+        assert_eq!(stage.due("Matching block [1/2, 2/2]").unwrap(), line);
         stage.last = Instant::now().checked_sub(INTERVAL).unwrap();
         assert_eq!(stage.due("").unwrap(), "matching: at work");
     }
