@@ -170,7 +170,7 @@ pub mod train;
 #[doc(inline)]
 pub use nightsplat_core::{
     Error, Result, Stop,
-    watch::{Progress, Watch},
+    watch::{Watch, WatchedProgress},
 };
 
 pub use {ash, glam};
@@ -196,8 +196,8 @@ pub use splats::lamp::Lamp;
 pub use splats::model::Model;
 pub use splats::packed_sh::StorageFormat;
 pub use splats::render::{
-    Damping, DepthConvention, DepthKind, Drawn, Gradients, Hit, Instance, Motion, Pick, Purpose,
-    RenderOptions, RenderSettings, Renderer, SceneDepth, Status, Target, Viewpoint,
+    Damping, DepthConvention, DepthKind, Drawn, Gradients, Instance, Motion, Pick, PickedSplat,
+    Purpose, RenderOptions, RenderSettings, Renderer, SceneDepth, Status, Target, Viewpoint,
 };
 pub use splats::scene::{DeviceGaussians, Features, GaussianSlice, Gaussians, Layout, Shape};
 

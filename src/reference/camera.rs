@@ -121,8 +121,8 @@ impl ReferenceCamera {
         }
     }
 
-    /// The gradient of the point; an orthographic camera has none. From those of its pixel and of the rows of
-    /// [`ReferenceCamera::jacobian`].
+    /// The gradient of the point, from those of its pixel and of the rows of [`ReferenceCamera::jacobian`]; none of an
+    /// orthographic camera.
     pub fn backward(&self, point: DVec3, d_pixel: DVec2, d_rows: [DVec3; 2]) -> DVec3 {
         let d_place = self.focal * d_pixel;
         let d_rows = [self.focal.x * d_rows[0], self.focal.y * d_rows[1]];

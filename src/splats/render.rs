@@ -56,7 +56,7 @@ pub use instances::Instance;
 pub(crate) use lamp::DeviceLamp;
 use motion::MotionVectors;
 use picks::Picks;
-pub use picks::{Hit, Pick};
+pub use picks::{Pick, PickedSplat};
 use pipelines::{ProjectionKind, Projections, WrittenGradients};
 pub use settings::{Purpose, RenderSettings};
 pub use target::{DepthConvention, DepthKind, Motion, SceneDepth, Target};

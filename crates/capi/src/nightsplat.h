@@ -323,8 +323,8 @@ typedef struct NspRender {
     // none. The point is at the depth in the view, infinitely far where there is no splat, and moves with the camera
     // and with the instance (`NspInstance::pose_before`) of the splat at which half of the light is blocked.
     const struct NspImage *motion_out;
-    // The cameras of the frame before, as many as `cameras`, of the same sizes and models; read with `motion_out`. With
-    // the principal point of this frame's, a jitter is left out.
+    // The cameras of the frame before, as many as `cameras`, of the same sizes and models; read with `motion_out`.
+    // With the principal point of this frame's, a jitter is left out.
     const struct NspCamera *cameras_before;
 } NspRender;
 
@@ -470,8 +470,8 @@ void nsp_device_destroy(struct NspDevice *device);
 
 // The camera of an engine's column-major view and projection matrices, for Vulkan's clip space (x right, y down,
 // depth 0 to 1, or reversed). The camera may look along z or -z, with y up or down. `width` and `height` are those of
-// the viewport in pixels. An orthographic projection gives an orthographic camera, which looks along the axis that makes
-// its image no mirror of the world.
+// the viewport in pixels. An orthographic projection gives an orthographic camera, which looks along the axis that
+// makes its image no mirror of the world.
 //
 // Errors: `NSP_ERROR_USAGE` if the projection is sheared, or if the matrices scale or mirror the world.
 NspResult nsp_camera_from_matrices(const float *view,
@@ -533,23 +533,23 @@ NspResult nsp_renderer_picked(const struct NspRenderer *renderer, struct NspPick
 void nsp_renderer_destroy(struct NspRenderer *renderer);
 
 // Creates a watch. `progress` is called with a stage, such as "decoding photographs" or "training", how much of it is
-// done, and all of it: from any thread, by one at a time. It may call `nsp_watch_stop`, and nothing else of the library.
-// NULL: progress is not told.
+// done, and all of it: from any thread, by one at a time. It may call `nsp_watch_stop`, and nothing else of the
+// library. NULL: progress is not told.
 NspResult nsp_watch_create(void (*progress)(void *user, const char *stage, uint64_t done, uint64_t all),
                            void *user,
                            struct NspWatch **watch);
 
-// Stops the call of a trainer that is running with the watch, or the next: it returns `NSP_ERROR_STOPPED`, after a call
-// that reports the steps done so far where there are any. The trainer can go on afterwards. May be called from any
-// thread.
+// Stops the call of a trainer that is running with the watch, or the next: it returns `NSP_ERROR_STOPPED`, after a
+// call that reports the steps done so far where there are any. The trainer can go on afterwards. May be called from
+// any thread.
 NspResult nsp_watch_stop(const struct NspWatch *watch);
 
 // Destroys a watch; trainers go on without it.
 void nsp_watch_destroy(struct NspWatch *watch);
 
 // Creates a trainer for the dataset in a folder. `config_toml` is text in the format of config.toml; NULL or empty:
-// the settings follow from the photographs. `watch` follows this call and the training; NULL: none. The device must not
-// be record-only.
+// the settings follow from the photographs. `watch` follows this call and the training; NULL: none. The device must
+// not be record-only.
 NspResult nsp_trainer_create(struct NspDevice *device,
                              const char *dataset,
                              const char *config_toml,

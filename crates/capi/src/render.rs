@@ -8,7 +8,7 @@ pub use ash::vk::{
 };
 use nightsplat::gpu::{Gpu, HostFrame, HostImage, ImageFormat, ImageState};
 use nightsplat::splats::render::{
-    DepthConvention, DepthKind, Drawn, Hit, Instance, Motion, Pick, Purpose, RenderOptions,
+    DepthConvention, DepthKind, Drawn, Instance, Motion, Pick, PickedSplat, Purpose, RenderOptions,
     RenderSettings, Renderer, SceneDepth, Target,
 };
 use nightsplat::splats::scene::MAX_SH_DEGREE;
@@ -454,8 +454,8 @@ fn lent(image: &NspImage, name: &str, cameras: u32) -> Result<HostImage, Failure
     let format = ImageFormat::from_vulkan(image.format.as_raw()).ok_or_else(|| {
         Failure::usage(format!(
             "{name} has format {:?}; take RGBA16F, RGBA32F, B10G11R11, RGBA8 or BGRA8 (UNORM, SRGB), A2B10G10R10 or \
-             A2R10G10B10 for color, R32F or D32 for depth_out, RG16F or RG32F for motion_out, D32, D24, D16 or R32F \
-             for scene_depth",
+             A2R10G10B10 for color, R32F or D32 for depth_out, RG16F or RG32F for motion_out, D32, D24, D16 or R32F for \
+             scene_depth",
             image.format
         ))
     })?;
@@ -517,8 +517,8 @@ pub unsafe extern "C" fn nsp_renderer_picked(
         // SAFETY: as the caller promises.
         let shown = unsafe { object(renderer, "renderer")? }.0.get("the renderer")?;
         let Pick { frame, hit } = shown.renderer.picked().unwrap_or(Pick { frame: 0, hit: None });
-        let none = Hit { instance: 0, gaussian: 0, depth: 0.0 };
-        let Hit { instance, gaussian, depth } = hit.unwrap_or(none);
+        let none = PickedSplat { instance: 0, gaussian: 0, depth: 0.0 };
+        let PickedSplat { instance, gaussian, depth } = hit.unwrap_or(none);
         let filled = NspPick {
             struct_size: size_of::<NspPick>(),
             frame,

@@ -8,11 +8,11 @@ mod training;
 
 use std::ffi::{CString, c_char, c_void};
 
+use nightsplat_core::watch::{Watch, WatchedProgress};
+
 use super::device::NspDevice;
 use super::error::{NspResult, guard};
 use super::model::NspModel;
-use nightsplat_core::watch::{Progress, Watch};
-
 use super::structs::{Sized0, destroy, give, object, object_mut};
 pub(super) use training::live;
 use training::{Training, advance, begin, checkpoint, current, has_ended, save, scores};
@@ -88,7 +88,7 @@ pub unsafe extern "C" fn nsp_watch_create(
         let made = || {
             let Some(function) = progress else { return Ok(NspWatch(Watch::default())) };
             let user = User(user);
-            let told = move |Progress { stage, done, all }: Progress| {
+            let told = move |WatchedProgress { stage, done, all }: WatchedProgress| {
                 let User(user) = { &user };
                 let stage = CString::new(stage).unwrap_or_default();
                 // SAFETY: as the host promises.

@@ -9,7 +9,7 @@ use crate::{Error, Result};
 
 /// How far watched work is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Progress {
+pub struct WatchedProgress {
     /// What is done: "decoding photographs", "compiling kernels", "training".
     pub stage: &'static str,
     /// Parts of the stage that are done.
@@ -35,7 +35,7 @@ pub struct Watch(Arc<Shared>);
 #[derive(Default)]
 struct Shared {
     is_stopped: AtomicBool,
-    report: Option<Mutex<Box<dyn FnMut(Progress) + Send>>>,
+    report: Option<Mutex<Box<dyn FnMut(WatchedProgress) + Send>>>,
 }
 
 thread_local! {
@@ -45,7 +45,7 @@ thread_local! {
 
 impl Watch {
     /// A watch that is told of progress, by one thread at a time but not always by the same.
-    pub fn new(report: impl FnMut(Progress) + Send + 'static) -> Self {
+    pub fn new(report: impl FnMut(WatchedProgress) + Send + 'static) -> Self {
         let report = Some(Mutex::new(Box::new(report) as Box<_>));
         Self(Arc::new(Shared { is_stopped: AtomicBool::new(false), report }))
     }
@@ -79,13 +79,13 @@ impl Watch {
         work()
     }
 
-    /// That of the work of this thread; without one, a watch without a report.
+    /// That of the work of this thread; one without a follower where there is none.
     #[doc(hidden)]
     pub fn current() -> Self {
         CURRENT.with_borrow(Self::clone)
     }
 
-    fn tell(&self, progress: Progress) {
+    fn tell(&self, progress: WatchedProgress) {
         if let Some(report) = &self.0.report {
             report.lock().unwrap_or_else(PoisonError::into_inner)(progress);
         }
@@ -145,7 +145,7 @@ impl Stage {
         if self.watch.is_stopped() {
             return Err(Error::Halted { stage: self.name });
         }
-        self.watch.tell(Progress { stage: self.name, done, all: self.all });
+        self.watch.tell(WatchedProgress { stage: self.name, done, all: self.all });
         Ok(())
     }
 }

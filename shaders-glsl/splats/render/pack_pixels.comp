@@ -11,8 +11,9 @@
 //! C = EOTF(c / alpha) exposure alpha. Over the host's picture U the result is C + T U, else C + T background. HDR10
 //! has them in the primaries of BT.2020 (BT.2087) and by the curve of ST 2084, where 1 is `nits` of 10 000.
 //!
-//! A depth z in the view is stored as d = e where depth is reversed and as d = 1 - e else: e = near (far - z) / (z (far
-//! - near)), e = near / z before an infinite far plane, and e = (far - z) / (far - near) of an orthographic camera.
+//! A depth z in the view is stored as d = e where depth is reversed and as d = 1 - e else:
+//! e = near (far - z) / (z (far - near)), e = near / z before an infinite far plane, and e = (far - z) / (far - near) of
+//! an orthographic camera.
 
 layout(local_size_x = 64) in;
 
@@ -121,8 +122,8 @@ vec4 load(uint at) {
     }
     vec4 pixel = unpackUnorm4x8(word);
     if (storage == STORED_TENS) {
-        const uvec4 most = uvec4(uvec3(1023u), 3u);
-        pixel = vec4(uvec4(word, word >> 10, word >> 20, word >> 30) & most) / vec4(most);
+        uvec4 codes = uvec4(word, word >> 10, word >> 20, word >> 30) & uvec4(uvec3(1023u), 3u);
+        pixel = vec4(codes) / vec4(vec3(1023.0), 3.0);
     }
     if (swaps != 0) pixel = pixel.bgra;
     if (light == LIGHT_SRGB) pixel.rgb = eotf(pixel.rgb);

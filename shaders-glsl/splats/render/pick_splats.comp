@@ -3,7 +3,7 @@
 #include "kernel.glsl"
 #include "splat.glsl"
 
-//! Pick splats: for each pixel of a run of pixels, the splat at which the transmittance falls to 1/2, that of the
+//! Pick splats: for each pixel of a run of pixels, the splat at which the transmittance falls to 1/2, which has the
 //! median depth of `blend_forward`. One thread per pixel, which walks the run of its tile.
 
 layout(local_size_x = 64) in;

@@ -36,8 +36,8 @@ impl Renderer {
         motion.pixels.grow(&self.gpu, pixels * image.format.bytes() / 4)
     }
 
-    /// Records the motion vectors of the view that was recorded last, of a camera that was `before` in the frame
-    /// before, whose instances begin with these splats.
+    /// Records the motion vectors of the view that was recorded last, of a camera that was another in the frame before.
+    /// Its instances begin with these splats.
     pub(super) fn record_motion(
         &mut self,
         pass: &mut Recorder<'_>,

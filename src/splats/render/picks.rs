@@ -16,12 +16,12 @@ pub struct Pick {
     /// The number of its frame; 0 for a submission of our own.
     pub frame: u64,
     /// `None`: less than half of the light is blocked.
-    pub hit: Option<Hit>,
+    pub hit: Option<PickedSplat>,
 }
 
 /// The Gaussian at which the transmittance of a pixel falls to 1/2.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Hit {
+pub struct PickedSplat {
     /// The index among the instances of the draw; 0 where a model is drawn.
     pub instance: usize,
     /// The index in its model.
@@ -128,7 +128,11 @@ impl Renderer {
             [splat, depth] if splat != NO_SPLAT => {
                 let at = firsts.partition_point(|first| first.splat <= splat).checked_sub(1)?;
                 let FirstSplat { splat: first, instance } = firsts[at];
-                Some(Hit { instance, gaussian: splat - first, depth: f32::from_bits(depth) })
+                Some(PickedSplat {
+                    instance,
+                    gaussian: splat - first,
+                    depth: f32::from_bits(depth),
+                })
             }
             _ => None,
         };

@@ -28,8 +28,8 @@ pub struct Target<'a> {
     pub depth: Option<&'a HostImage>,
     /// The kind of depth in `depth`.
     pub depth_kind: DepthKind,
-    /// The meaning of the values of `depth`; [`DepthConvention::Linear`] is infinite where there is no splat, others
-    /// are at the far plane.
+    /// The meaning of the values of `depth`; where there is no splat, [`DepthConvention::Linear`] is infinite, and
+    /// others are at the far plane.
     pub depth_convention: DepthConvention,
     /// The host's depth buffer, which occludes splats.
     pub scene: Option<SceneDepth<'a>>,
@@ -76,8 +76,8 @@ impl Default for Target<'_> {
 
 /// Motion vectors: from each pixel to where its point was seen in the frame before, in pixels, x right and y down. The
 /// point is at the depth of [`Target::depth_kind`], and moves with the camera and with the instance of the Gaussian at
-/// which half of the light is blocked ([`Instance::before`](crate::Instance::before)); infinitely far where no splat
-/// is.
+/// which half of the light is blocked ([`Instance::before`](crate::Instance::before)). Where no splat is, it is
+/// infinitely far.
 #[derive(Clone, Copy, Debug)]
 pub struct Motion<'a> {
     /// RG16F or RG32F.
@@ -367,7 +367,7 @@ impl SceneDepth<'_> {
 }
 
 /// A convention as kernels take it.
-struct TargetPlanes {
+struct DepthPlanes {
     is_linear: bool,
     is_reversed: bool,
     near: f32,
@@ -376,12 +376,12 @@ struct TargetPlanes {
 }
 
 impl DepthConvention {
-    fn planes(self) -> TargetPlanes {
+    fn planes(self) -> DepthPlanes {
         let (near, far) = match self {
             Self::Linear => (1.0, None),
             Self::Forward { near, far } | Self::Reversed { near, far } => (near, far),
         };
-        TargetPlanes {
+        DepthPlanes {
             is_linear: self == Self::Linear,
             is_reversed: matches!(self, Self::Reversed { .. }),
             near,

@@ -1,7 +1,7 @@
 //! What is under a pixel, where it was in the frame before, and cameras without perspective.
 
 use glam::DQuat;
-use nightsplat::splats::render::{Hit, Instance, Motion, Pick};
+use nightsplat::splats::render::{Instance, Motion, Pick, PickedSplat};
 
 use super::*;
 
@@ -124,23 +124,24 @@ fn check_motion(
         let world = camera.view_from_world.inverse().transform_point3(point);
         let moved = |instance: &Instance<'_>| {
             let (pose, scale) = instance.before.unwrap_or((instance.pose, instance.scale));
-            let within = instance.pose.inverse().transform_point3(world) / instance.scale;
-            before.view_from_world.transform_point3(pose.transform_point3(scale * within))
+            let in_model = instance.pose.inverse().transform_point3(world) / instance.scale;
+            before.view_from_world.transform_point3(pose.transform_point3(scale * in_model))
         };
-        let shift = |view: DVec3| {
-            let at = match camera.model {
+        let motion_of = |view: DVec3| {
+            let slope = match camera.model {
                 CameraModel::Orthographic => view.truncate(),
                 _ => view.truncate() / view.z,
             };
-            before.focal * at + before.principal_point - pixel
+            before.focal * slope + before.principal_point - pixel
         };
-        let of_world = shift(before.view_from_world.transform_point3(world));
+        let of_world = motion_of(before.view_from_world.transform_point3(world));
         if !is_seen {
             assert!(vector.distance(of_world) < 2e-3, "{at}: {vector} {of_world}");
             continue;
         }
-        let found =
-            instances.iter().position(|instance| shift(moved(instance)).distance(*vector) < 2e-3);
+        let found = instances
+            .iter()
+            .position(|instance| motion_of(moved(instance)).distance(*vector) < 2e-3);
         seen[found.unwrap_or_else(|| panic!("pixel {at} moved by {vector}"))] += 1;
     }
     assert!(seen.iter().all(|&pixels| pixels > 20), "{seen:?}");
@@ -186,11 +187,11 @@ fn a_pick_names_the_instance_and_the_gaussian_once_its_frame_is_done() {
             assert!(before.is_none_or(|pick| pick.frame < frame), "the frame is not submitted");
             host.submit_frame(commands, frame);
             host.wait_frame(frame);
-            let Pick { frame: of, hit } = renderer.picked().unwrap();
-            assert_eq!(of, frame);
+            let Pick { frame: done, hit } = renderer.picked().unwrap();
+            assert_eq!(done, frame);
             hit
         };
-        let hit = |instance, gaussian, depth| Some(Hit { instance, gaussian, depth });
+        let hit = |instance, gaussian, depth| Some(PickedSplat { instance, gaussian, depth });
         assert_eq!(picked(&[far, near], [24, 20]), hit(1, 66, 2.0));
         assert_eq!(picked(&[hidden, far, near], [24, 20]), hit(2, 66, 2.0));
         assert_eq!(picked(&[far, hidden], [24, 20]), hit(0, 3, 3.0));
@@ -277,14 +278,14 @@ fn an_orthographic_camera_sees_along_parallel_rays() {
         mean += pixel / places.len() as f64;
     }
     assert!(mean.distance(center) < 0.05 && places.len() > 40, "{mean} of {}", places.len());
-    // Its mirror, seen from the far side, has the harmonics of the other direction.
+    // From the other side it has the harmonics of the other direction.
     let turned = DAffine3::from_rotation_translation(
         DQuat::from_rotation_y(std::f64::consts::PI),
         DVec3::new(0.0, 0.0, 9.0),
     );
-    let (turned_round, _) = drawn(1.0, &Camera { view_from_world: turned, ..camera });
+    let (opposite, _) = drawn(1.0, &Camera { view_from_world: turned, ..camera });
     let middle = |data: &[f32]| data.iter().take(PIXELS).fold(0.0f32, |a, b| a.max(*b));
-    let [front, back] = [middle(&near), middle(&turned_round)];
+    let [front, back] = [middle(&near), middle(&opposite)];
     let share = (front - back) / (front + back);
     assert!((share - 0.4886025).abs() < 0.01, "{front} {back}");
 }

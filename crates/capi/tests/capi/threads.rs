@@ -31,7 +31,7 @@ struct Told {
 }
 
 /// # Safety
-/// `user` is a lock with a [`Told`] in it.
+/// `user` is a [`Told`] in a lock.
 unsafe extern "C" fn tell(user: *mut c_void, stage: *const c_char, done: u64, all: u64) {
     // SAFETY: as above; the stage ends with NUL.
     let (told, stage) = unsafe { (&*user.cast::<Mutex<Told>>(), CStr::from_ptr(stage)) };
@@ -225,14 +225,14 @@ fn calls_keep_to_their_time_and_train_the_same_bits() {
             scores[..scored as usize].iter().map(|score| (score.step, score.psnr.to_bits()));
         (last.step, last.loss.to_bits(), last.gaussians, scores.collect::<Vec<_>>(), calls.len())
     };
-    let (step, loss, gaussians, scores, in_long_calls) = train(60_000);
+    let (step, loss, gaussians, scores, least) = train(60_000);
     assert_eq!(step, 120);
     assert!(!scores.is_empty());
     for milliseconds in [200, 50, 1] {
         let (other_step, other_loss, others, other_scores, many) = train(milliseconds);
         assert_eq!((other_step, other_loss, others), (step, loss, gaussians));
         assert_eq!(other_scores, scores);
-        assert!(many > in_long_calls, "{many} calls");
+        assert!(many > least, "{many} calls");
     }
     session.end();
 }
