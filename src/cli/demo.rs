@@ -57,8 +57,8 @@ pub fn run(args: &DemoArgs) -> Result<()> {
         parsed("demo", command("sweep", &paths, &[&SWEEP[..], &steps].concat()))?;
     let intro = format!(
         "Trained on photographs that are underexposed by a factor of {}, with shot and read noise, at 8 bits. Each \
-         tone curve maps the photographs to the targets of training. The reference images in normal light are used for the \
-         scores only.",
+         tone curve maps the photographs to the targets of training. The reference images in normal light are used for \
+         the scores only.",
         nightsplat_synth::DARKENING
     );
     let window = [

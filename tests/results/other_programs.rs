@@ -18,13 +18,13 @@ fn renders_of_another_program_are_scored_like_our_own() {
     let workspace = Workspace::new();
     let path = |name: &str| workspace.path(name).display().to_string();
     succeed(&workspace.train("a", "--steps 20"));
-    let own = json(&succeed(&format!("eval {} --save-images --json", path("a"))));
+    let ours = json(&succeed(&format!("eval {} --save-images --json", path("a"))));
     // Our renders in another folder are those of another program.
     fs::rename(workspace.path("a/eval/renders"), workspace.path("theirs")).unwrap();
     let page = path("page.html");
     let eval = format!("eval {} --renders {}", path("a"), path("theirs"));
     let theirs = json(&succeed(&format!("{eval} --report {page} --json")));
-    assert_eq!((&theirs["mean"], &theirs["views"]), (&own["mean"], &own["views"]));
+    assert_eq!((&theirs["mean"], &theirs["views"]), (&ours["mean"], &ours["views"]));
     assert!(theirs["gaussians"].is_null() && theirs["renders"] == path("theirs"), "{theirs}");
     assert!(fs::read_to_string(&page).unwrap().contains("theirs"));
 
@@ -49,7 +49,7 @@ fn renders_of_another_program_are_scored_like_our_own() {
     let csv = fs::read_to_string(workspace.path("sweep/leaderboard.csv")).unwrap();
     assert_eq!(csv.lines().count(), 4, "{csv}");
     let row = csv.lines().find(|line| line.contains("gsplat")).unwrap();
-    assert!(row.contains(&own["mean"]["psnr"].to_string()), "{row}");
+    assert!(row.contains(&ours["mean"]["psnr"].to_string()), "{row}");
     let html = fs::read_to_string(workspace.path("sweep/index.html")).unwrap();
     assert!(html.contains("min(t*a,1)^0.5;a=0.7") && html.contains(">gsplat<"));
 

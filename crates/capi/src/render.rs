@@ -454,8 +454,8 @@ fn lent(image: &NspImage, name: &str, cameras: u32) -> Result<HostImage, Failure
     let format = ImageFormat::from_vulkan(image.format.as_raw()).ok_or_else(|| {
         Failure::usage(format!(
             "{name} has format {:?}; take RGBA16F, RGBA32F, B10G11R11, RGBA8 or BGRA8 (UNORM, SRGB), A2B10G10R10 or \
-             A2R10G10B10 for color, R32F or D32 for depth_out, RG16F or RG32F for motion_out, D32, D24, D16 or R32F for \
-             scene_depth",
+             A2R10G10B10 for color, R32F or D32 for depth_out, RG16F or RG32F for motion_out, D32, D24, D16 or R32F \
+             for scene_depth",
             image.format
         ))
     })?;

@@ -12,8 +12,8 @@
 //! has them in the primaries of BT.2020 (BT.2087) and by the curve of ST 2084, where 1 is `nits` of 10 000.
 //!
 //! A depth z in the view is stored as d = e where depth is reversed and as d = 1 - e else:
-//! e = near (far - z) / (z (far - near)), e = near / z before an infinite far plane, and e = (far - z) / (far - near) of
-//! an orthographic camera.
+//! e = near (far - z) / (z (far - near)), e = near / z before an infinite far plane, and e = (far - z) / (far - near)
+//! of an orthographic camera.
 
 layout(local_size_x = 64) in;
 

@@ -131,10 +131,10 @@ pub(super) fn shading(
 ) -> (FalloffDiagnosis, BandsDiagnosis, LampObservations) {
     let falloff = FalloffDiagnosis::new(&rows, corner);
     let fall = if falloff.is_found() { rows.fall(falloff.falloff) } else { vec![] };
-    let lifted: Vec<f64> = fall.iter().map(|stops| -stops).collect();
+    let raised: Vec<f64> = fall.iter().map(|stops| -stops).collect();
     let rows = rows.without(&fall);
     let (bands, in_rows) = BandsDiagnosis::new(&rows, names);
-    let rows = rows.without(&in_rows).without(&lifted);
+    let rows = rows.without(&in_rows).without(&raised);
     let falloff = if bands.is_found() { FalloffDiagnosis::new(&rows, corner) } else { falloff };
     (falloff, bands, rows)
 }

@@ -140,8 +140,8 @@ fn set_stored_as_seen(tiff: &mut [u8]) -> Option<()> {
 }
 
 /// The eighths of its size at which an image is decoded that is reduced by this factor: a smaller DCT of the low
-/// frequencies of each block. At least a factor of two is left to the mean of the pixels, which keeps what rounding each
-/// to 8 bits would lose of the dark; an eighth, the mean of a block, is rounded by .2 of a code on average.
+/// frequencies of each block. At least a factor of two is left to the mean of the pixels, which keeps what rounding
+/// each to 8 bits would lose of the dark; an eighth, the mean of a block, is rounded by .2 of a code on average.
 fn scale(factor: u32) -> u8 {
     match factor {
         0..4 => 8,
