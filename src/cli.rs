@@ -60,7 +60,13 @@ use tell::{print, tell};
 
 /// 3D Gaussian Splatting from dark photographs, on any Vulkan device.
 #[derive(Debug, Parser)]
-#[command(name = "nightsplat", version, max_term_width = 98, after_help = EXAMPLES)]
+#[command(
+    name = "nightsplat",
+    version,
+    max_term_width = 98,
+    override_usage = "nightsplat PHOTOS\n       nightsplat [OPTIONS] <COMMAND>",
+    after_help = EXAMPLES
+)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -100,6 +106,8 @@ Exit codes:
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    // `nightsplat PHOTOS` is its name.
+    #[command(hide = true)]
     Make(Box<make::MakeArgs>),
     Train(Box<train::TrainArgs>),
     Diagnose(diagnose::DiagnoseArgs),

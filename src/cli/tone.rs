@@ -17,7 +17,7 @@ pub struct ToneArgs {
 enum ToneCommand {
     List(list::ListArgs),
     Apply(Box<apply::ApplyArgs>),
-    Fit(fit::FitArgs),
+    Fit(Box<fit::FitArgs>),
 }
 
 /// Runs the subcommand.

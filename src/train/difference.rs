@@ -98,10 +98,10 @@ mod tests {
             config.difference(&other).unwrap(),
             format!("tone.alpha = {}, not 0.25", config.tone.alpha)
         );
-        let mut curve = TrainConfig::default();
-        curve.tone = nightsplat_photographs::tone::ToneSettings::new(
+        let tone = nightsplat_photographs::tone::ToneSettings::new(
             nightsplat_photographs::tone::ToneCurve::Ap3,
         );
+        let curve = TrainConfig { tone, ..TrainConfig::default() };
         assert_eq!(
             config.difference(&curve).unwrap(),
             "tone.curve (--curve) = \"auto\", not \"ap3\"",

@@ -153,7 +153,9 @@ fn a_crop_to_the_cameras_spares_what_training_views_show() {
     let list = path("edits.json");
     let stdout = succeed(&format!("{crop} --out {} --save-edits {list}", path("near.ply")));
     let near = ply::load(workspace.path("near.ply")).unwrap();
-    assert!(near.means().iter().all(|mean| mean.y < 250.0), "{stdout}");
+    // All but some that are large enough to reach into a view.
+    let far = near.means().iter().filter(|mean| mean.y >= 250.0).count();
+    assert!(far <= trained.count / 100, "{far}: {stdout}");
     let [before, after] = before_and_after(&stdout);
     assert!((after - before).abs() < 0.01, "{stdout}");
     assert!(stdout.contains("crop to the sphere at [") && !stdout.contains("00000000"), "{stdout}");

@@ -32,10 +32,13 @@ pub struct WatchedProgress {
 #[derive(Clone, Default)]
 pub struct Watch(Arc<Shared>);
 
+/// What is told of progress.
+type Report = Box<dyn FnMut(WatchedProgress) + Send>;
+
 #[derive(Default)]
 struct Shared {
     is_stopped: AtomicBool,
-    report: Option<Mutex<Box<dyn FnMut(WatchedProgress) + Send>>>,
+    report: Option<Mutex<Report>>,
 }
 
 thread_local! {
@@ -46,7 +49,7 @@ thread_local! {
 impl Watch {
     /// A watch that is told of progress, by one thread at a time but not always by the same.
     pub fn new(report: impl FnMut(WatchedProgress) + Send + 'static) -> Self {
-        let report = Some(Mutex::new(Box::new(report) as Box<_>));
+        let report = Some(Mutex::new(Box::new(report) as Report));
         Self(Arc::new(Shared { is_stopped: AtomicBool::new(false), report }))
     }
 

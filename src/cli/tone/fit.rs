@@ -82,6 +82,7 @@ impl Default for FamilyChoice {
 
 /// The curves to fit.
 #[derive(Clone, Debug, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "a command has one")]
 pub enum FamilyChoice {
     /// Every family with constants.
     All,

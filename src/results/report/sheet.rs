@@ -52,7 +52,7 @@ impl ContactSheet {
 
     /// A photograph at the size of the sheet.
     pub fn shrunk(&self, image: &Image) -> Image {
-        let shown = self.count.min(MOST).max(1) as f64;
+        let shown = self.count.clamp(1, MOST) as f64;
         let aspect = f64::from(image.height) / f64::from(image.width.max(1));
         let [least, most] = WIDTHS;
         let width = (PIXELS / (2.0 * shown * aspect.max(1e-3))).sqrt().clamp(least, most);

@@ -205,7 +205,7 @@ fn no_wrong_call_ends_the_process() {
         // Each case leaves what it made, and the layer's state of a forked process is not its own.
         let done = run(&program, folder.path(), &["model.ply"], "");
         let lines = printed(&done);
-        assert!(lines.ends_with("0 of 11 cases are wrong\n"), "{lines}");
+        assert!(lines.ends_with("0 of 12 cases are wrong\n"), "{lines}");
     }
 }
 
