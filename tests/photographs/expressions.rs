@@ -71,7 +71,7 @@ fn kernels_apply_a_formula_to_a_hundredth_of_a_code_and_its_inverse_undoes_it() 
         for (&x, &y) in photograph.data.iter().zip(&mapped.data) {
             let t = f64::from(x) / f64::from(measured.statistics.p90);
             let expected = settings.value(t, &measured.statistics);
-            // Except at the corner of min, where a knot of the table may miss the curve by half of its rise to the next.
+            // Except at the corner of min, where a knot of the table may miss the curve by half of a step of it.
             let bound = if text.starts_with("min") { 1.0 } else { 0.01 } / 255.0;
             assert!((f64::from(y) - expected).abs() < bound, "{text} at {x}: {y}, not {expected}");
             if y > 0.01 && y < 0.85 {
