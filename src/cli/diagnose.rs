@@ -203,8 +203,11 @@ fn text(
 /// The plan, one decision per paragraph; without `everything`, what is on.
 pub(super) fn decisions(plan: &Plan, everything: bool) -> String {
     let decisions = plan.decisions();
-    let shown: Vec<&(&str, String, &str)> =
-        decisions.iter().filter(|(_, decided, _)| everything || decided != "off").collect();
+    // What makes the targets is told in any case.
+    let is_shown = |(part, decided, _): &&(&str, String, &str)| {
+        everything || decided != "off" || *part == "curve"
+    };
+    let shown: Vec<&(&str, String, &str)> = decisions.iter().filter(is_shown).collect();
     let width =
         |of: fn(&(&str, String, &str)) -> usize| decisions.iter().map(of).max().unwrap_or(0);
     let (name, value) = (width(|one| one.0.len()), width(|one| one.1.len()));

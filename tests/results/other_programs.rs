@@ -82,7 +82,7 @@ fn targets_of_another_program_are_trained_on_and_labelled_everywhere() {
         format!("train {set} --out {} --model plain --sh-degree 1 --steps 30 {options}", path(out))
     };
     let (stdout, message) = run(&train("theirs", &format!("--targets {toned}")), 0);
-    let printed = stdout + &message;
+    let printed = (stdout + &message).split_whitespace().collect::<Vec<_>>().join(" ");
     assert!(printed.contains("targets of another program, toned"), "{printed}");
     assert!(printed.contains("% of their pixels are clipped at white"), "{printed}");
 
