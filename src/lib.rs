@@ -208,7 +208,7 @@ pub use nightsplat_photographs::{
     dataset::{Dataset, DepthOptions, LoadOptions, Original, Point, RowBands, Split, View},
     image::{ImageFile, Mask, Orientation},
     metrics::Scores,
-    tone::{Profile, Table, Tone, ToneCurve, ToneSettings},
+    tone::{Expression, Profile, Table, Tone, ToneCurve, ToneSettings},
     white_balance::WhiteBalance,
 };
 #[cfg(feature = "train")]
