@@ -221,19 +221,15 @@ impl Error {
     /// An [`Error::Input`]. The problem may quote the file: it becomes one line of limited length.
     #[doc(hidden)]
     pub fn input(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
-        Self::Input {
-            path: path.as_ref().to_owned(),
-            problem: in_a_line(String::as_str(&problem.into())),
-        }
+        let problem: String = problem.into();
+        Self::Input { path: path.as_ref().to_owned(), problem: in_a_line(&problem) }
     }
 
     /// An [`Error::Output`].
     #[doc(hidden)]
     pub fn output(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
-        Self::Output {
-            path: path.as_ref().to_owned(),
-            problem: in_a_line(String::as_str(&problem.into())),
-        }
+        let problem: String = problem.into();
+        Self::Output { path: path.as_ref().to_owned(), problem: in_a_line(&problem) }
     }
 
     /// Whether this is no failure: somebody stopped the work, which goes on when the command is repeated.
