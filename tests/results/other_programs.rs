@@ -106,7 +106,7 @@ fn targets_of_another_program_are_trained_on_and_labelled_everywhere() {
     let law = "comment nightsplat law";
     assert!(header("ours").contains(law) && !header("theirs").contains(law));
     refused(
-        &format!("render {} --as linear --out {}", path("theirs"), path("linear")),
+        &format!("render {} --split all --as linear --out {}", path("theirs"), path("linear")),
         2,
         &["targets of another program have no curve"],
     );
