@@ -106,7 +106,11 @@ fn targets_of_another_program_are_trained_on_and_labelled_everywhere() {
     let law = "comment nightsplat law";
     assert!(header("ours").contains(law) && !header("theirs").contains(law));
     refused(
-        &format!("render {} --split all --as linear --out {}", path("theirs"), path("linear")),
+        &format!(
+            "render {} --split all --as linear --format exr --out {}",
+            path("theirs"),
+            path("linear")
+        ),
         2,
         &["targets of another program have no curve"],
     );

@@ -277,7 +277,11 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
     refuses(&mut trainer, &edited("checkpoint 1", "checkpoint 9"), &["is not a `nightsplat"]);
     refuses(&mut trainer, &edited("visit_counts", "visit_c0unts"), &["density.visit_counts"]);
     refuses(&mut trainer, &edited("first_moments", "first_m0ments"), &["gaussians.first_moments"]);
-    refuses(&mut trainer, &edited("seed = 10", "seed = 11"), &["seed = 11, not 10", "--overwrite"]);
+    refuses(
+        &mut trainer,
+        &edited("seed = 10", "seed = 11"),
+        &["seed (--seed) = 11, not 10", "--overwrite"],
+    );
     refuses(&mut trainer, &edited("steps = 30", "stepz = 30"), &["another version"]);
     let file = SafeTensors::deserialize(&whole).unwrap();
     let sums = file.tensor("density.grad_norm_sums").unwrap().data();
@@ -368,7 +372,7 @@ fn a_killed_run_is_resumed_to_the_same_model() {
     assert!(model(&killed) != model(&straight));
 
     refused(&train(&killed, "--steps 203 --resume --overwrite"), 2, &["--overwrite"]);
-    refused(&train(&killed, "--steps 300 --resume --seed 4"), 3, &["seed = 10, not 4"]);
+    refused(&train(&killed, "--steps 300 --resume --seed 4"), 3, &["seed (--seed) = 10, not 4"]);
     refused(&train(&killed, "--steps 199 --resume"), 3, &["at step 203", "raise steps"]);
     fs::write(killed.join("train.csv"), "step,view\n1,000,1\n").unwrap();
     refused(&train(&killed, "--steps 300 --resume"), 3, &["train.csv", "step 203"]);

@@ -209,7 +209,7 @@ impl Frame {
         let mut svg = text(dvec2(0.0, 14.0), "", &chart.y_name);
         if self.has_bars {
             let start = self.y.start();
-            if start != 0.0 {
+            if start > 0.0 {
                 let x = self.y.from;
                 svg += &text(dvec2(x, TOP - 4.0), "", &format!("from {}", self.y.label(start)));
                 svg += &line(dvec2(x, TOP), dvec2(x, self.height), " stroke=\"var(--line)\"");
@@ -315,7 +315,7 @@ impl Frame {
 
     /// Names, bars and values; `ends` are the positions of the drawable points.
     fn bar(&self, series: &Series, ends: &[DVec2], color: &str) -> String {
-        let zero = self.position(0.0, self.y.start()).x;
+        let begin = self.position(0.0, self.y.start().max(0.0)).x;
         let rows = series.points.iter().filter(|(x, _)| is_drawable(*x, 0.0, false));
         let name = |&(x, _): &(f64, f64)| {
             let at = dvec2(self.y.from - 8.0, self.x.position(x + 0.5) + 4.0);
@@ -325,8 +325,8 @@ impl Frame {
         let values = series.points.iter().filter(|&&(x, y)| is_drawable(x, y, false));
         for (&(_, value), end) in values.zip(ends) {
             let highest = series.spreads.iter().map(|&(x, _, high)| self.position(x, high).x);
-            let highest = highest.filter(|x| x.is_finite()).fold(end.x.max(zero), f64::max);
-            let (x, y, width) = (end.x.min(zero), end.y - ROW / 2.0 + 2.0, (end.x - zero).abs());
+            let highest = highest.filter(|x| x.is_finite()).fold(end.x.max(begin), f64::max);
+            let (x, y, width) = (end.x.min(begin), end.y - ROW / 2.0 + 2.0, (end.x - begin).abs());
             let height = ROW - 5.0;
             let _ = write!(
                 svg,
