@@ -3,7 +3,8 @@
 //! The only module that speaks Vulkan, and the only one with `unsafe`. It rests on four rules:
 //!
 //! - one queue, one timeline semaphore, one `u64` per submission; nothing waits for the whole device;
-//! - a dropped buffer or pipeline is freed once every submission, ours or a host's, that may use it is done;
+//! - a dropped buffer is freed once every submission, ours or a host's, that may use it is done; a pipeline is compiled
+//!   once and kept as long as the device;
 //! - barriers follow from what a kernel declares it reads and writes, never from the caller;
 //! - a borrowed device ([`Gpu::from_host`]) keeps everything that it had: we destroy what we created and nothing else.
 
@@ -49,7 +50,7 @@ mod tuning;
 mod upload;
 mod validation;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread::{self, ThreadId};
@@ -173,6 +174,8 @@ struct GpuShared {
     /// The threads whose submissions are checked.
     checks: checked::Checks,
     pipeline_cache: vk::PipelineCache,
+    /// All that were compiled, by the address of the kernel's interface and the constants.
+    pipelines: Mutex<HashMap<(usize, Vec<(u32, u32)>), pipeline::Objects>>,
     /// The file of the fastest tiles, read on first use.
     tuned_tiles: OnceLock<Vec<TunedTile>>,
     /// What we created around the device and destroy with it; `None` for a borrowed device.
@@ -222,7 +225,6 @@ struct LastUse {
 /// A Vulkan object whose owner is gone.
 enum Retired {
     Buffer(vk::Buffer, allocated::Allocation),
-    Pipeline(vk::Pipeline, vk::PipelineLayout, vk::DescriptorSetLayout),
     Commands(vk::CommandPool),
     Descriptors(vk::DescriptorPool),
     Queries(vk::QueryPool),
@@ -354,11 +356,6 @@ impl GpuShared {
                         memory.free(allocation);
                     }
                 }
-                Retired::Pipeline(raw, layout, set_layout) => {
-                    self.device.destroy_pipeline(raw, callbacks);
-                    self.device.destroy_pipeline_layout(layout, callbacks);
-                    self.device.destroy_descriptor_set_layout(set_layout, callbacks);
-                }
                 Retired::Commands(pool) => self.device.destroy_command_pool(pool, callbacks),
                 Retired::Descriptors(pool) => self.device.destroy_descriptor_pool(pool, callbacks),
                 Retired::Queries(pool) => self.device.destroy_query_pool(pool, callbacks),
@@ -379,8 +376,10 @@ impl Drop for GpuShared {
         if let Some(owned) = &self.owned {
             owned.save_pipeline_cache(&self.device, self.pipeline_cache);
         }
+        let pipelines = std::mem::take(&mut *lock(&self.pipelines));
         // SAFETY: every object below was created here and nothing uses it any more.
         unsafe {
+            pipelines.values().for_each(|objects| self.destroy_pipeline(objects));
             if !self.host.as_ref().is_some_and(|host| host.lends_pipeline_cache) {
                 self.device.destroy_pipeline_cache(self.pipeline_cache, self.callbacks());
             }

@@ -176,6 +176,7 @@ impl Gpu {
                 recorded: super::Recorded::default(),
                 checks: Checks::default(),
                 pipeline_cache,
+                pipelines: Mutex::default(),
                 owned,
             }),
         })

@@ -1,5 +1,6 @@
 //! A kernel specialised for its constants and the device.
 
+use std::collections::hash_map::Entry;
 use std::io::Cursor;
 use std::sync::Arc;
 
@@ -7,7 +8,7 @@ use ash::vk;
 use nightsplat_core::watch::Stage;
 
 use super::{
-    Gpu, GpuShared, Interface, Kernel, Properties, Retired, Statistic, reconvergence, spirv,
+    Gpu, GpuShared, Interface, Kernel, Properties, Statistic, lock, reconvergence, spirv,
     statistics,
 };
 use crate::{Error, Result};
@@ -18,16 +19,17 @@ pub struct Pipeline<K: Kernel> {
     /// What it is specialised for.
     pub(super) constants: K::Constants,
     pub(super) objects: Objects,
+    pub(super) shared: Arc<GpuShared>,
 }
 
-/// The Vulkan objects of a kernel.
-#[derive(Debug)]
+/// The Vulkan objects of a kernel with its constants. A device compiles them once and keeps them to its end: trainers
+/// and renderers that come later find them.
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Objects {
     pub(super) interface: &'static Interface,
     pub(super) raw: vk::Pipeline,
     pub(super) layout: vk::PipelineLayout,
     pub(super) set_layout: vk::DescriptorSetLayout,
-    pub(super) shared: Arc<GpuShared>,
 }
 
 impl Gpu {
@@ -35,7 +37,7 @@ impl Gpu {
     #[doc(hidden)]
     pub fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
         let objects = self.objects(K::INTERFACE, K::constants(constants))?;
-        let pipeline = Pipeline { constants: *constants, objects };
+        let pipeline = Pipeline { constants: *constants, objects, shared: self.shared.clone() };
         if let Some(file) = statistics::file() {
             let all = pipeline.statistics()?.unwrap_or_default();
             let kernel = K::INTERFACE.name;
@@ -61,33 +63,56 @@ impl Gpu {
         let _phase = tracing::info_span!("pipelines").entered();
         Stage::begin("compiling kernels", 1).next()?;
         let shared = &self.shared;
-        let fail = |call| move |result| shared.error(call, result);
         let name = described(interface, &constants);
-        tracing::debug!("compiles {name}");
         #[cfg(debug_assertions)]
         shared.faults.compile(interface.name).map_err(|result| refused(shared, &name, result))?;
-        // SAFETY: every create info points at live locals, and what fails half-way is destroyed here.
-        unsafe {
-            let set_layout =
-                set_layout(shared, interface).map_err(fail("vkCreateDescriptorSetLayout"))?;
-            let layout = match pipeline_layout(shared, interface, set_layout) {
-                Ok(layout) => layout,
-                Err(result) => {
-                    shared.device.destroy_descriptor_set_layout(set_layout, shared.callbacks());
-                    return Err(shared.error("vkCreatePipelineLayout", result));
-                }
-            };
-            match raw_pipeline(shared, interface, layout, constants, Default::default()) {
-                Ok(raw) => {
-                    shared.name(raw, &name);
-                    let shared = Arc::clone(shared);
-                    Ok(Objects { interface, raw, layout, set_layout, shared })
-                }
-                Err(result) => {
-                    shared.device.destroy_pipeline_layout(layout, shared.callbacks());
-                    shared.device.destroy_descriptor_set_layout(set_layout, shared.callbacks());
-                    Err(refused(shared, &name, result))
-                }
+        let key = (std::ptr::from_ref(interface) as usize, constants.clone());
+        if let Some(&known) = lock(&shared.pipelines).get(&key) {
+            return Ok(known);
+        }
+        tracing::debug!("compiles {name}");
+        // Unlocked, so that threads compile different kernels at the same time.
+        let compiled = compiled(shared, interface, constants, &name)?;
+        match lock(&shared.pipelines).entry(key) {
+            // Another thread was faster.
+            Entry::Occupied(known) => {
+                // SAFETY: nothing uses what was compiled here.
+                unsafe { shared.destroy_pipeline(&compiled) };
+                Ok(*known.get())
+            }
+            Entry::Vacant(vacant) => Ok(*vacant.insert(compiled)),
+        }
+    }
+}
+
+/// Compiles the kernel called `name`.
+fn compiled(
+    shared: &GpuShared,
+    interface: &'static Interface,
+    constants: Vec<(u32, u32)>,
+    name: &str,
+) -> Result<Objects> {
+    let fail = |call| move |result| shared.error(call, result);
+    // SAFETY: every create info points at live locals, and what fails half-way is destroyed here.
+    unsafe {
+        let set_layout =
+            set_layout(shared, interface).map_err(fail("vkCreateDescriptorSetLayout"))?;
+        let layout = match pipeline_layout(shared, interface, set_layout) {
+            Ok(layout) => layout,
+            Err(result) => {
+                shared.device.destroy_descriptor_set_layout(set_layout, shared.callbacks());
+                return Err(shared.error("vkCreatePipelineLayout", result));
+            }
+        };
+        match raw_pipeline(shared, interface, layout, constants, Default::default()) {
+            Ok(raw) => {
+                shared.name(raw, name);
+                Ok(Objects { interface, raw, layout, set_layout })
+            }
+            Err(result) => {
+                shared.device.destroy_pipeline_layout(layout, shared.callbacks());
+                shared.device.destroy_descriptor_set_layout(set_layout, shared.callbacks());
+                Err(refused(shared, name, result))
             }
         }
     }
@@ -96,7 +121,7 @@ impl Gpu {
 impl<K: Kernel> Pipeline<K> {
     /// The driver's statistics of the kernel; `None` where the driver has none. Compiles it again.
     pub fn statistics(&self) -> Result<Option<Vec<Statistic>>> {
-        let shared = &self.objects.shared;
+        let shared = &self.shared;
         let Some(functions) = &shared.executables else { return Ok(None) };
         let fail = |call| move |result| shared.error(call, result);
         let constants = K::constants(&self.constants);
@@ -247,6 +272,18 @@ unsafe fn raw_pipeline(
 }
 
 impl GpuShared {
+    /// # Safety
+    /// No submission uses the pipeline any more, and it is destroyed once.
+    pub(super) unsafe fn destroy_pipeline(&self, objects: &Objects) {
+        let callbacks = self.callbacks();
+        // SAFETY: as the caller promises.
+        unsafe {
+            self.device.destroy_pipeline(objects.raw, callbacks);
+            self.device.destroy_pipeline_layout(objects.layout, callbacks);
+            self.device.destroy_descriptor_set_layout(objects.set_layout, callbacks);
+        }
+    }
+
     /// Names an object for captures and validation messages.
     fn name<H: vk::Handle>(&self, object: H, name: &str) {
         let (Some(debug), Ok(name)) = (&self.debug, std::ffi::CString::new(name)) else { return };
@@ -254,11 +291,5 @@ impl GpuShared {
             vk::DebugUtilsObjectNameInfoEXT::default().object_handle(object).object_name(&name);
         // SAFETY: the object belongs to this device; a name that is refused is not missed.
         let _ = unsafe { debug.set_debug_utils_object_name(&info) };
-    }
-}
-
-impl Drop for Objects {
-    fn drop(&mut self) {
-        self.shared.retire(Retired::Pipeline(self.raw, self.layout, self.set_layout));
     }
 }

@@ -94,6 +94,10 @@ fn open(adapt: impl FnOnce(&mut GpuShared)) -> Gpu {
         shared.properties.is_cpu &=
             std::env::var_os(AS_A_GPU_VARIABLE).is_none_or(|value| value.is_empty());
         adapt(shared);
+        // What was compiled so far, was for other properties.
+        let compiled = std::mem::take(&mut *super::lock(&shared.pipelines));
+        // SAFETY: nothing was submitted since the self-test, which waits for its end.
+        compiled.values().for_each(|objects| unsafe { shared.destroy_pipeline(objects) });
     }
     gpu
 }
@@ -114,6 +118,11 @@ pub fn misuse(gpu: &Gpu) {
 pub fn recorded(gpu: &Gpu) -> [u64; 2] {
     let super::Recorded { dispatches, barriers, .. } = &gpu.shared.recorded;
     [dispatches, barriers].map(|count| count.load(Ordering::Relaxed))
+}
+
+/// The number of kernels that the device has compiled, each with its constants.
+pub fn compiled(gpu: &Gpu) -> usize {
+    super::lock(&gpu.shared.pipelines).len()
 }
 
 /// The number of command buffers submitted to the device since it was opened.

@@ -1,8 +1,10 @@
 //! Devices without push descriptors bind sets, with the same results.
 
-use nightsplat::gpu::testing::gpu_that_binds_sets;
+use std::thread;
+
+use nightsplat::gpu::testing::{compiled, gpu_that_binds_sets};
 use nightsplat::gpu::{PUSH_VARIABLE, Threads};
-use nightsplat::kernels::relu_backward;
+use nightsplat::kernels::{blend_forward, relu_backward};
 
 use crate::common::command::{command, succeed};
 
@@ -22,6 +24,23 @@ fn descriptors_in_sets_train_to_the_bits_of_pushed_ones() {
     succeed(&format!("synth {} --views 4 --width 32 --height 24", path("scene")));
     let [pushed, in_sets] = ["on", "off"].map(|push| trained(&path("scene"), &path(push), push));
     assert!(pushed == in_sets, "the models differ");
+}
+
+#[test]
+fn a_device_compiles_a_kernel_once_for_each_choice_of_constants_and_keeps_it() {
+    let gpu = gpu_that_binds_sets();
+    let before = compiled(&gpu);
+    let compile = |channels| {
+        let constants = blend_forward::Constants { channels, ..Default::default() };
+        drop(gpu.pipeline::<blend_forward::Kernel>(&constants).unwrap());
+    };
+    compile(3);
+    compile(4);
+    assert_eq!(compiled(&gpu), before + 2);
+    thread::scope(|scope| {
+        (0..4).for_each(|_| drop(scope.spawn(|| [3, 4, 5].map(compile))));
+    });
+    assert_eq!(compiled(&gpu), before + 3);
 }
 
 #[test]

@@ -37,7 +37,11 @@ const BUDGET: &[(&str, usize, &str)] = &[
         7622,
         "Arguments and text of the commands, one for all of them, and words for every verdict.",
     ),
-    ("src/gpu", 7459, "Vulkan: devices, buffers, passes, checks; what hosts of any version lend."),
+    (
+        "src/gpu",
+        7475,
+        "Vulkan: devices, buffers, passes, checks; what hosts of any version lend; kernels compiled once.",
+    ),
     ("src/live", 913, "The live page of a run."),
     ("src/loss", 2095, "The terms of the loss."),
     ("src/networks", 2656, "Denoiser, tonemapper, structure and LPIPS."),

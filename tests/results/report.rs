@@ -123,8 +123,8 @@ fn the_page_has_no_external_references() {
 fn every_text_is_escaped() {
     let html = page("<b onload=\"x('&')\">");
     assert!(!html.contains("<b onload"));
-    // Title, heading, the address and the title of a window and those of its link, paragraph, a link with its address, a fact with its caption, two captions with alternative texts,
-    // row title, plot label, axes, legend and its title.
+    // Title, heading, the address and the title of a window and those of its link, paragraph, a link with its address,
+    // a fact with its caption, two captions with alternative texts, row title, plot label, axes, legend and its title.
     assert_eq!(html.matches("&lt;b onload=&quot;x(&#39;&amp;&#39;)&quot;&gt;").count(), 23);
 }
 
