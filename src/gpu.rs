@@ -50,7 +50,7 @@ mod tuning;
 mod upload;
 mod validation;
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread::{self, ThreadId};
@@ -174,8 +174,7 @@ struct GpuShared {
     /// The threads whose submissions are checked.
     checks: checked::Checks,
     pipeline_cache: vk::PipelineCache,
-    /// All that were compiled, by the address of the kernel's interface and the constants.
-    pipelines: Mutex<HashMap<(usize, Vec<(u32, u32)>), pipeline::Objects>>,
+    pipelines: Mutex<pipeline::CompiledKernels>,
     /// The file of the fastest tiles, read on first use.
     tuned_tiles: OnceLock<Vec<TunedTile>>,
     /// What we created around the device and destroy with it; `None` for a borrowed device.

@@ -1,5 +1,6 @@
 //! A kernel specialised for its constants and the device.
 
+use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use std::io::Cursor;
 use std::sync::Arc;
@@ -31,6 +32,9 @@ pub(super) struct Objects {
     pub(super) layout: vk::PipelineLayout,
     pub(super) set_layout: vk::DescriptorSetLayout,
 }
+
+/// By the address of a kernel's interface, and its constants.
+pub(super) type CompiledKernels = HashMap<(usize, Vec<(u32, u32)>), Objects>;
 
 impl Gpu {
     /// Specialises kernel `K` with `constants`.
