@@ -1,7 +1,7 @@
 //! Cameras, from the attributes of `nightsplat.Camera`.
 
 use nightsplat::glam::{DAffine3, DMat3, DVec2, DVec3};
-use nightsplat_core::camera::{Distortion, Lens, deviation_from_rigid};
+use nightsplat_core::camera::{CameraModel, Distortion, Lens, deviation_from_rigid};
 use pyo3::prelude::*;
 
 use crate::arrays::numbers;
@@ -15,19 +15,23 @@ pub(crate) struct PyCamera<'py> {
     focal: [f64; 2],
     principal_point: Option<[f64; 2]>,
     fisheye: Option<[f64; 4]>,
+    is_orthographic: bool,
 }
 
 impl PyCamera<'_> {
     /// The library's camera; refused where the pose is not rigid or the lens cannot be used.
     pub(crate) fn checked(&self) -> PyResult<nightsplat::Camera> {
-        let Self { view_from_world, size: [width, height], focal, principal_point, fisheye } = self;
+        let Self { view_from_world, size: [width, height], focal, principal_point, .. } = self;
         let (m, _) = numbers::<f64>("a pose", view_from_world, &[4, 4])?;
         let column = |column: usize| DVec3::new(m[column], m[4 + column], m[8 + column]);
         let turn = DMat3::from_cols(column(0), column(1), column(2));
         let view_from_world = DAffine3::from_mat3_translation(turn, column(3));
         let middle = DVec2::new((*width).into(), (*height).into()) / 2.0;
-        let [k1, k2, k3, k4] = fisheye.unwrap_or_default();
-        let is_fisheye = fisheye.is_some();
+        let [k1, k2, k3, k4] = self.fisheye.unwrap_or_default();
+        let is_fisheye = self.fisheye.is_some();
+        if is_fisheye && self.is_orthographic {
+            return Err(usage("a camera is a fisheye or orthographic, not both"));
+        }
         let lens = Lens {
             width: *width,
             height: *height,
@@ -42,7 +46,10 @@ impl PyCamera<'_> {
             return Err(usage("the pose is not rigid; take scale and reflection out"));
         }
         let Lens { width, height, focal, principal_point, .. } = lens;
-        let model = lens.model().unwrap_or_default();
+        let model = match self.is_orthographic {
+            true => CameraModel::Orthographic,
+            false => lens.model().unwrap_or_default(),
+        };
         Ok(nightsplat::Camera { width, height, focal, principal_point, model, view_from_world })
     }
 }
@@ -65,11 +72,12 @@ pub(crate) fn of_python<'py>(
     };
     let pose = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]];
     let fisheye = match camera.model {
-        nightsplat::CameraModel::Fisheye(lens) => Some(lens.coefficients),
-        nightsplat::CameraModel::Pinhole => None,
+        CameraModel::Fisheye(lens) => Some(lens.coefficients),
+        CameraModel::Pinhole | CameraModel::Orthographic => None,
     };
+    let is_orthographic = camera.model == CameraModel::Orthographic;
     let (size, focal) = ((camera.width, camera.height), <(f64, f64)>::from(camera.focal));
     let principal_point = <(f64, f64)>::from(camera.principal_point);
     let class = py.import("nightsplat._camera")?.getattr("Camera")?;
-    class.call1((pose, size, focal, principal_point, fisheye))
+    class.call1((pose, size, focal, principal_point, fisheye, is_orthographic))
 }

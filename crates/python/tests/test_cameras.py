@@ -45,6 +45,17 @@ def test_perspective_has_the_field_of_view_and_resizing_keeps_it():
     assert camera.resized((128, 96)).focal == pytest.approx((48, 48))
 
 
+def test_an_orthographic_camera_has_pixels_per_world_unit():
+    camera = Camera.orthographic(FORWARD, 2.0, (64, 48))
+    assert camera.focal == (24, 24) and camera.is_orthographic
+    smaller = camera.resized((32, 24))
+    assert smaller.focal == (12, 12) and smaller.is_orthographic
+    with pytest.raises(nightsplat.UsageError, match="its focal length"):
+        Camera.orthographic(FORWARD, 0.0, (64, 48))
+    with pytest.raises(nightsplat.UsageError, match="a fisheye or orthographic, not both"):
+        Camera(FORWARD, (64, 48), (24, 24), fisheye=(0, 0, 0, 0), is_orthographic=True)
+
+
 @pytest.mark.parametrize(
     ("pose", "size", "focal", "problem"),
     [

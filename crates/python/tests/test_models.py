@@ -68,6 +68,16 @@ def test_a_splat_has_its_depth_colour_and_alpha(device):
     assert render.alpha[0, 0] == 0 and np.isinf(render.depth[0, 0])
 
 
+def test_parallel_rays_show_a_splat_as_large_from_farther_away(device):
+    model = Model.from_arrays([[0, 0, 3]], [[1, 0, 0, 0]], [[-1, -1, -1]], [2.0], np.float32([[0.2, 0.5, 0.8]]))
+    renderer, away = Renderer(model, device), np.eye(4)
+    away[2, 3] = 4.0
+    near, far = (renderer.render(Camera.orthographic(pose, 2.0, (64, 48))) for pose in (np.eye(4), away))
+    assert near.alpha[24, 32] > 0.8
+    np.testing.assert_allclose(far.alpha, near.alpha, atol=1e-5)
+    assert far.depth[24, 32] - near.depth[24, 32] == pytest.approx(4, abs=1e-4)
+
+
 def test_positions_far_from_the_origin_keep_their_precision(arrays, device):
     here = Renderer(Model.from_arrays(**arrays), device).render(forward())
     far = np.array([5e5, 4e6, 300.0])

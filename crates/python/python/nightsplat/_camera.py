@@ -13,7 +13,7 @@ Four = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole or fisheye camera with its pose.
+    """A pinhole, fisheye or orthographic camera with its pose.
 
     View space has the axes of OpenCV: x right, y down, z forward. Pixel coordinates: the image's corner is (0, 0),
     pixel centres are at +0.5.
@@ -26,11 +26,13 @@ class Camera:
     size: tuple[int, int]
     """Width and height, pixels."""
     focal: Pair
-    """Focal lengths in x and y, pixels."""
+    """Focal lengths in x and y, pixels; of an orthographic camera pixels per world unit."""
     principal_point: Pair | None = None
     """Pixels; None is the middle of the image."""
     fisheye: Four | None = None
     """The coefficients of an OpenCV fisheye; None is a pinhole."""
+    is_orthographic: bool = False
+    """Whether all rays are parallel. Such a camera is rendered, not trained on."""
 
     def __post_init__(self) -> None:
         from ._native import check_camera
@@ -45,6 +47,12 @@ class Camera:
         """A pinhole with square pixels, centred; `fov_y` is the vertical field of view, radians."""
         focal = size[1] / 2 / float(np.tan(fov_y / 2))
         return Camera(view_from_world, size, (focal, focal))
+
+    @staticmethod
+    def orthographic(view_from_world: npt.ArrayLike, height: float, size: tuple[int, int]) -> Camera:
+        """Parallel rays and square pixels, centred; the image is `height` world units high."""
+        focal = size[1] / height if height else 0.0
+        return Camera(view_from_world, size, (focal, focal), is_orthographic=True)
 
     @staticmethod
     def from_colmap(
@@ -91,7 +99,8 @@ class Camera:
         """The same camera with another image size."""
         x, y = (new / old for new, old in zip(size, self.size))
         point = self.principal_point and (self.principal_point[0] * x, self.principal_point[1] * y)
-        return Camera(self.view_from_world, size, (self.focal[0] * x, self.focal[1] * y), point, self.fisheye)
+        focal = (self.focal[0] * x, self.focal[1] * y)
+        return Camera(self.view_from_world, size, focal, point, self.fisheye, self.is_orthographic)
 
 
 def _whole(pose: npt.ArrayLike) -> npt.NDArray[np.float64]:
