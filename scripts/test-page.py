@@ -407,9 +407,9 @@ def live(browser, nightsplat, dataset, run):
         (run / "exported.html").write_text(exported)
         browser.evaluate("document.getElementById('stop').click()")
         code = serving.process.wait(PATIENCE)
-        browser.wait("document.getElementById('progress').textContent.startsWith('stopped at step')")
+        browser.wait("document.getElementById('progress').textContent.startsWith('stopped after step')")
         end = browser.evaluate("document.getElementById('progress').textContent")
-    is_right = seconds <= 2.0 and code == 130 and "of at most 100000" in line and ", saved" in end
+    is_right = seconds <= 2.0 and code == 130 and "of at most 100000" in line and ", saved; go on with" in end
     failed += report(is_right, f"live: a checkpoint is shown after {seconds:.2f} s; code {code}; {line}; {end}")
     ready = browser.open((run / "exported.html").as_uri())
     is_right = ready == "true" and browser.evaluate("root.dataset.face === 'share' && !element('divider').hidden")
