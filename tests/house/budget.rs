@@ -28,7 +28,7 @@ const BUDGET: &[(&str, usize, &str)] = &[
         15704,
         "Images, datasets, tone curves, formulas too, and what is measured of photographs, bands too.",
     ),
-    ("crates/python", 1650, "The Python package, its types and its tests, with orthographic cameras."),
+    ("crates/python", 1650, "The Python package, its types and tests, orthographic cameras too."),
     ("crates/synth", 1656, "Synthetic sets, with nights and faults of cameras; varied sets."),
     ("src/bench", 1100, "What `bench` measures."),
     ("src/blocks", 1399, "Scenes that outgrow a device, in parts."),
