@@ -9,10 +9,7 @@ use crate::train::{TrainConfig, values};
 
 /// The options of a command that `-h` shows; of a command that is not listed it shows all.
 const COMMON: [(&str, &str); 11] = [
-    (
-        "make",
-        "out title no-open finish overwrite preset downscale max-vram set matcher fps colmap device view progress",
-    ),
+    ("make", "out title no-open finish overwrite preset downscale fps device view"),
     (
         "train",
         "out resume finish overwrite preset steps curve downscale max-vram device view explain",

@@ -29,10 +29,14 @@ pub(super) fn frames(
     let pattern = pattern(folder);
     let options = ["-hide_banner", "-nostdin", "-i"].map(OsStr::new);
     let files = [clip.as_os_str(), "-vf".as_ref(), filter.as_ref(), pattern.as_os_str()];
-    ffmpeg.run("", &[&options[..], &files].concat(), None, |_| {})?;
+    let decoded = ffmpeg.run("", &[&options[..], &files].concat(), None, |_| {});
+    decoded.map_err(|error| match error {
+        Error::Input { path, problem } => no_frames(clip, &format!("{}{problem}", path.display())),
+        error => error,
+    })?;
     let frames = photographs_in(folder)?;
     if frames.is_empty() {
-        return Err(Error::input(clip, "contains no frame that ffmpeg can decode"));
+        return Err(no_frames(clip, "it has no pictures"));
     }
     if transfer.is_none() {
         tracing::warn!(
@@ -56,6 +60,15 @@ pub(super) fn frames(
         }
     }
     Ok(kept)
+}
+
+fn no_frames(clip: &Path, why: &str) -> Error {
+    let why = match fs::metadata(clip) {
+        Ok(file) if file.len() == 0 => "the file is empty",
+        _ => why,
+    };
+    let remedy = "pass a clip that plays, a folder of photographs or a dataset";
+    Error::input(clip, format!("is no clip that ffmpeg can decode ({why}); {remedy}"))
 }
 
 /// The files of the frames, for ffmpeg: a per cent sign of the folder is doubled.

@@ -2,6 +2,8 @@
 
 use glam::{DAffine3, DVec2, DVec3};
 use nightsplat_core::camera::{Camera, CameraModel};
+use nightsplat_core::image::srgb_from_linear;
+use nightsplat_core::random::Stream;
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{
     CurveEnds, Exposure, LuminanceHistogram, MeasuredPhotograph, NEAR_WHITE, Statistics,
@@ -345,4 +347,27 @@ fn a_photograph_of_one_channel_has_the_brightness_of_that_channel() {
     green[30_000..60_000].copy_from_slice(&grey[30_000..60_000]);
     let [grey, green] = [grey, green].map(|planes| exposure(&[planes]).unwrap());
     assert!((green.gain / grey.gain - 1.0).abs() < 1e-9, "{}, not {}", green.gain, grey.gain);
+}
+
+#[test]
+fn noise_that_reaches_below_black_hardly_changes_the_gain() {
+    // Light that changes slowly, in three colours.
+    let light =
+        |i: usize| 0.002 + 0.01 * (i % 4096) as f32 / 4096.0 * (1.0 - 0.2 * (i / 20_000) as f32);
+    let clean: Vec<f32> = (0..60_000).map(light).collect();
+    let median = 0.006;
+    let stream = Stream::new(1, 1);
+    let gain = |decibels: Option<f32>| {
+        let sigma = decibels.map_or(0.0, |decibels| median * 10.0_f32.powf(-decibels / 20.0));
+        let noisy = (0..)
+            .zip(&clean)
+            .map(|(i, light)| srgb_from_linear(light + sigma * stream.normal(i) as f32));
+        let measured = MeasuredPhotograph::measure(&noisy.collect::<Vec<_>>());
+        Exposure::measure([&measured.luminance], None).unwrap().gain
+    };
+    let right = gain(None);
+    for decibels in [10.0, 6.0, 3.0, 0.0, -4.0] {
+        let found = gain(Some(decibels));
+        assert!((found / right).log2().abs() < 0.15, "{decibels} dB: {found} for {right}");
+    }
 }

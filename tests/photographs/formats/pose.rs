@@ -253,6 +253,7 @@ fn problems_before_the_start_are_reported_in_a_line() {
     refused(&train, 3, &["9 photographs", "nightsplat pose", "--out DATASET"]);
     fs::create_dir(root.join("empty")).unwrap();
     fs::write(root.join("clip.mp4"), "no clip").unwrap();
+    fs::write(root.join("no.mp4"), "").unwrap();
     fs::create_dir(root.join("twice")).unwrap();
     for copy in ["twice/v00.png", "twice/v00.webp", "twice/v01.png"] {
         fs::copy(photos.join("v01.png"), root.join(copy)).unwrap();
@@ -265,12 +266,23 @@ fn problems_before_the_start_are_reported_in_a_line() {
     assert!(run(&absent, 2).1.len() < 240, "a short line");
     refused(&format!("{absent} --patience -1"), 2, &["--patience"]);
     let ffmpeg = "--ffmpeg /nowhere/ffmpeg";
-    let cases: [(&str, &str, i32, &[&str]); 7] = [
+    let cases: [(&str, &str, i32, &[&str]); 8] = [
         ("absent", "", 3, &["absent", "cannot be read"]),
         ("empty", "", 3, &["contains 0 photographs"]),
         ("photos", "--fps 0", 2, &["--fps"]),
         ("clip.mp4", ffmpeg, 2, &["`/nowhere/ffmpeg` is", "apt install ffmpeg", "--ffmpeg PATH"]),
-        ("clip.mp4", "--ffmpeg false", 3, &["false", "ended with"]),
+        (
+            "clip.mp4",
+            "--ffmpeg false",
+            3,
+            &["clip.mp4: is no clip", "false", "ended with", "pass a clip"],
+        ),
+        (
+            "no.mp4",
+            "--ffmpeg false",
+            3,
+            &["no.mp4: is no clip", "the file is empty", "pass a clip"],
+        ),
         ("twice", "", 3, &["v00.png and v00.webp have the same name"]),
         ("black", "", 3, &["/black", "black"]),
     ];

@@ -1,7 +1,10 @@
 //! From the measurements of a photograph to its curve, at a gain that follows from the exposure if it is automatic.
 
+use std::borrow::Cow;
+
 use nightsplat_core::camera::Camera;
 use nightsplat_core::curves::{Constants, Curve, Real, Variable, White, clamped, curve_at, padded};
+use nightsplat_core::image::{linear_from_srgb, srgb_from_linear};
 
 use super::exposure::Exposure;
 use super::histogram::LuminanceHistogram;
@@ -41,10 +44,35 @@ pub struct MeasuredPhotograph {
     pub camera: Option<Camera>,
 }
 
+/// The number of pixels of a row over which light is averaged.
+const RUN: usize = 32;
+
+/// The share of negative values from which on it is.
+const BELOW_BLACK: f64 = 0.02;
+
+/// The planes to measure: where noise is so strong that it reaches below black, each value is the mean light of a run
+/// of pixels. Encoding is concave, so it takes off the mean of what is noisy; cutting at black adds to it.
+fn without_noise(planes: &[f32]) -> Cow<'_, [f32]> {
+    let negative = planes.iter().filter(|value| **value < 0.0).count();
+    if negative as f64 <= BELOW_BLACK * planes.len() as f64 {
+        return planes.into();
+    }
+    let averaged = |run: &[f32]| {
+        let light = run.iter().filter(|value| value.is_finite());
+        let sum: f64 = light.map(|value| f64::from(linear_from_srgb(*value))).sum();
+        vec![srgb_from_linear((sum / run.len() as f64) as f32); run.len()]
+    };
+    planes
+        .chunks(planes.len().div_ceil(3))
+        .flat_map(|plane| plane.chunks(RUN))
+        .flat_map(averaged)
+        .collect()
+}
+
 impl MeasuredPhotograph {
     /// Measures the planes (3, pixels) of a photograph.
     pub fn measure(planes: &[f32]) -> Self {
-        let (luminance, luminances, sums) = LuminanceHistogram::counted(planes);
+        let (luminance, luminances, sums) = LuminanceHistogram::counted(&without_noise(planes));
         let statistics = Statistics::of_luminances(luminances, sums);
         Self { statistics, luminance, camera: None }
     }

@@ -91,9 +91,8 @@ pub fn luminance([r, g, b]: [f32; 3]) -> f32 {
     0.299 * r + 0.587 * g + 0.114 * b
 }
 
-/// A value that the statistics accept: finite and not negative. Targets keep the sign of noise at black; statistics do
-/// not: encoding takes more off the mean of what is noisy than negative values do, so that with a signal-to-noise ratio
-/// of -4 dB at the median the gain was off by .6 stops with signs, and by .3 without.
+/// A value that the statistics accept: finite and not negative. Targets keep the sign of noise at black; statistics are
+/// of light that is averaged until little of it is negative.
 pub fn measurable(x: f32) -> f32 {
     // Written so that a NaN fails.
     if x > 0.0 { x.min(65504.0) } else { 0.0 }
