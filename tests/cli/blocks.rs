@@ -122,7 +122,7 @@ fn the_joined_tiles_are_those_of_the_cores_and_are_opened_like_a_run() {
     assert_eq!(scores["gaussians"].as_u64(), Some(counts));
     assert!(scores["mean"]["psnr"].as_f64().unwrap() > 12.0, "{}", scores["mean"]);
     let exported = city.path("city.ply");
-    succeed(&format!("export {} --format ply --out {}", folder.display(), exported.display()));
+    succeed(&format!("export {} --out {}", folder.display(), exported.display()));
     let exported = String::from_utf8_lossy(&fs::read(exported).unwrap()).into_owned();
     assert!(exported.contains(&format!("element vertex {counts}\n")));
     // Tile by tile, in two levels of the same cells.

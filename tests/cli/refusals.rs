@@ -192,6 +192,15 @@ fn an_output_that_cannot_be_written_is_refused_before_anything_is_read() {
     }
 }
 
+#[test]
+fn an_export_has_the_format_of_its_ending_or_says_that_there_is_none() {
+    let formats = "has the ending of no format; pass --format: ply, spz, glb";
+    refused("export run --out model.xyz", 2, &["model.xyz", formats]);
+    refused("export run --out model", 2, &[formats]);
+    refused("export run --format spz --out a.ply", 2, &["a.ply is a file of --format ply"]);
+    refused("export run", 2, &["--format"]);
+}
+
 /// `nightsplat` with arguments, in a shell after these words.
 #[cfg(unix)]
 fn after(shell: &str, arguments: &str) -> std::process::Output {
