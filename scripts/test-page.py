@@ -459,19 +459,18 @@ def keyboard_alone(browser, page):
     """Every control of the bar is reached and used without a mouse, with a ring around it; a link carries the look."""
     browser.open(page.as_uri())
     browser.resize(800, 600)
-    found = []
+    found, rings = [], []
     for _ in range(8):
         found.append(browser.evaluate("document.activeElement.id"))
-        press_key(browser, "Tab")
-    browser.evaluate("element('about').focus()")
-    ring = browser.evaluate("getComputedStyle(element('about')).outlineStyle")
-    press_key(browser, "Enter", "\r")
+        rings.append(browser.evaluate("getComputedStyle(document.activeElement).outlineStyle"))
+        press_key(browser, "Tab" if len(found) < 8 else "Enter", "" if len(found) < 8 else "\r")
     opened = browser.evaluate("element('info').open")
     press_key(browser, "Escape")
     back = browser.evaluate("!element('info').open && document.activeElement.id === 'about'")
     bar = ["canvas", "divider", "play", "before", "brightness", "warmth", "fullscreen", "about"]
-    is_right = found == bar and ring == "solid" and opened and back
-    failed = report(is_right, f"with a keyboard alone: {found}; ring {ring}")
+    # The divider has its ring around the handle.
+    is_right = found == bar and set(rings[2:]) == {"solid"} and opened and back
+    failed = report(is_right, f"with a keyboard alone: {found}; rings {rings}")
 
     browser.evaluate("element('brightness').focus()")
     press_key(browser, "ArrowRight")
