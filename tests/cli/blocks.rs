@@ -1,10 +1,7 @@
 //! Scenes in blocks: plan, run, join, and what is refused.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
-
 use crate::common::command::{Folder, json};
+use crate::common::prelude::*;
 
 const PLAN: &str = "--blocks 2 --steps 120 --seed 3 --sh-degree 1 --max-gaussians 3000 --plan none";
 
@@ -68,7 +65,7 @@ fn a_dry_run_writes_nothing() {
     assert!(text.contains("2 blocks, each with") && text.contains("120 steps of"), "{text}");
     let json = json(shared().succeed(&format!("{dry} --json")));
     assert_eq!(json["block"].as_array().unwrap().len(), 4);
-    let steps = |row: &serde_json::Value| row["steps"].as_u64().unwrap();
+    let steps = |row: &Value| row["steps"].as_u64().unwrap();
     let blocks: u64 = json["block"].as_array().unwrap().iter().map(steps).sum();
     assert_eq!((steps(&json["coarse"]), blocks), (15, 105));
     assert!(!shared().path("dry").exists());
@@ -217,7 +214,7 @@ fn a_full_disk_stops_an_export_of_tiles_with_one_line_and_leaves_no_index_until_
     // Limits the size of files, as on a full disk.
     let program = shared.command("").get_program().to_str().unwrap().to_owned();
     let line = format!("trap '' XFSZ; ulimit -f 4; exec {program} {}", shared.named(&export));
-    let output = std::process::Command::new("sh").args(["-c", &line]).output().unwrap();
+    let output = Command::new("sh").args(["-c", &line]).output().unwrap();
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{stderr}");
     let is_told = stderr.contains(&out.display().to_string()) && stderr.contains("the disk");

@@ -1,14 +1,11 @@
 //! The live page of `view` and `train --view`, asked as a browser asks and as an attacker does.
 
-use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
-use std::process::{Child, Stdio};
-use std::time::{Duration, Instant};
-
-use serde_json::Value;
+use std::process::Child;
 
 use crate::common::command::{Folder, json};
+use crate::common::prelude::*;
 use crate::fixture;
 
 /// A command that serves a page, until it is dropped.

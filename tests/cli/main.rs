@@ -1,14 +1,9 @@
 //! The built binary as a shell runs it: its files, its output, and its errors for bad input.
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
-use std::fs;
-use std::sync::OnceLock;
-
 use nightsplat::kernels;
 use nightsplat::networks::lpips::Network;
-use nightsplat_photographs::image::{Image, ImageFile};
-use nightsplat_photographs::metrics::{self, Scores};
-use serde_json::Value;
+use nightsplat_photographs::metrics;
 
 mod blocks;
 #[path = "../common/mod.rs"]
@@ -26,6 +21,8 @@ mod tuning;
 mod unread;
 use common::command::{Folder, file_names, json, says, succeed};
 use common::copy;
+
+use crate::common::prelude::*;
 
 const TRAIN: &str = "--steps 40 --seed 3 --sh-degree 1 --curve ap3 --model plain";
 
@@ -330,7 +327,7 @@ fn a_closed_pipe_ends_a_command_quietly() {
         let mut command = fixture().command(arguments);
         let (reader, writer) = std::io::pipe().unwrap();
         drop(reader);
-        let output = command.stdout(writer).stderr(std::process::Stdio::piped()).output().unwrap();
+        let output = command.stdout(writer).stderr(Stdio::piped()).output().unwrap();
         let message = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success() && !message.contains("error"), "{arguments}: {message}");
     }

@@ -1,13 +1,8 @@
 //! Errors of the binary for bad input.
 
-use std::fs;
-use std::path::Path;
-
-use nightsplat_photographs::image::{Image, ImageFile};
-use serde_json::Value;
-
 use crate::common::command::{Folder, refused_with, says};
 use crate::common::fixture as committed;
+use crate::common::prelude::*;
 use crate::{copied_set, fixture};
 
 /// Trainings, `TRAIN`, and other commands that must be refused with one line, and leave no run that looks complete.
@@ -168,7 +163,7 @@ fn an_output_that_cannot_be_written_is_refused_before_anything_is_read() {
 #[cfg(unix)]
 fn after(shell: &str, folder: &Folder, arguments: &str) -> (Option<i32>, String) {
     let nightsplat = folder.command(arguments);
-    let mut sh = std::process::Command::new("sh");
+    let mut sh = Command::new("sh");
     sh.args(["-c", &format!("{shell}; exec \"$0\" \"$@\"")]).arg(nightsplat.get_program());
     sh.args(nightsplat.get_args());
     sh.envs(nightsplat.get_envs().filter_map(|(name, value)| Some((name, value?))));

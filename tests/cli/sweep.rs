@@ -1,13 +1,9 @@
 //! A sweep trains every point once, survives being killed, and always ranks its points in the same way.
 
-use std::fs;
 use std::ops::Deref;
-use std::path::Path;
-use std::process::{Command, Stdio};
-use std::sync::OnceLock;
-use std::time::{Duration, Instant};
 
 use crate::common::command::{Folder, command, json, refused, run, says};
+use crate::common::prelude::*;
 
 /// The smallest dataset with views to score.
 fn set() -> &'static Path {
@@ -78,7 +74,7 @@ impl Sweep {
 #[test]
 fn a_sweep_survives_the_replacement_of_its_program() {
     let sweep = Sweep::new("--steps 2 --curves linear,ase");
-    let program = sweep.folder.path().with_extension("program");
+    let program = sweep.folder.with_extension("program");
     fs::copy(command("").get_program(), &program).unwrap();
     let mut sweeping = Command::new(&program)
         .args(sweep.arguments.split_whitespace())
@@ -212,7 +208,7 @@ fn the_offset_sweep_marks_the_adaptive_black_level() {
 #[test]
 fn tables_and_all_curves_are_grids() {
     let lines = |options: &str| Sweep::new(options).left();
-    let curves = nightsplat_photographs::tone::ToneCurve::ALL.len();
+    let curves = ToneCurve::ALL.len();
     assert_eq!(lines("--curves all").len(), curves);
     assert_eq!(lines("--table leaderboard --seeds 1,2").len(), 2 * curves);
     assert_eq!(lines("--table offset").len(), 10);

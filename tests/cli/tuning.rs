@@ -1,11 +1,10 @@
 //! `bench --tune`, its file, and the tiles that training takes from it.
 
 use crate::common::command::{Folder, json};
+use crate::common::prelude::*;
 use nightsplat::gpu::Tile;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::results::run;
-use nightsplat::splats::render::RenderSettings;
-use serde_json::{Value, json};
+use serde_json::json;
 
 /// A folder with a dataset of dark photographs, whose runs read the fastest tiles from a file next to it.
 fn workspace() -> Folder {

@@ -1,16 +1,14 @@
 //! Commands whose output has no reader: they do their work all the same.
 #![cfg(unix)]
 
-use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs::File;
 use std::net::{TcpListener, TcpStream};
-use std::path::Path;
-use std::process::{Command, Output, Stdio};
-use std::time::{Duration, Instant};
+use std::process::Output;
 
 use nightsplat::gpu::testing::not_run;
 
 use crate::common::command::{Folder, command, exists};
+use crate::common::prelude::*;
 use crate::fixture;
 
 /// What standard error is; standard output is a pipe without a reader then.

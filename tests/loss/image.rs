@@ -1,16 +1,12 @@
 //! L1 and SSIM of an image.
 
-use std::sync::OnceLock;
-
-use glam::UVec2;
 use nightsplat::Result;
-use nightsplat::gpu::testing::{gpu, gpu_with};
-use nightsplat::gpu::{Gpu, Threads};
 use nightsplat::kernels::{l1, ssim};
 use nightsplat::loss::{Gradient, Loss, LossInputs, LossRegion, Term};
 use nightsplat::reference::ssim::{gradient, ssim};
 
 use super::{NOT_FINITE, Torch, assert_close, bits, central_differences, largest, log_step};
+use crate::common::prelude::*;
 
 const SIZES: [[u32; 2]; 8] =
     [[1, 1], [3, 1], [1, 40], [5, 7], [17, 33], [16, 64], [33, 65], [131, 97]];

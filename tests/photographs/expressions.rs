@@ -2,16 +2,11 @@
 
 use std::f64::consts::PI;
 
-use nightsplat::targets::pseudo_gt::PseudoGt;
-use nightsplat::train::TrainConfig;
 use nightsplat_fit::{FitOptions, Pair, fit};
-use nightsplat_photographs::image::Image;
 use nightsplat_photographs::scene_tone::SceneTone;
-use nightsplat_photographs::tone::{
-    CurveChoice, InverseTone, MeasuredPhotograph, Statistics, Tone, ToneSettings,
-};
+use nightsplat_photographs::tone::{CurveChoice, InverseTone, MeasuredPhotograph, Tone};
 
-use nightsplat::gpu::testing::gpu;
+use crate::common::prelude::*;
 
 fn settings(text: &str) -> ToneSettings {
     text.parse::<CurveChoice>().unwrap().settings().unwrap_or_else(|error| panic!("{error}"))

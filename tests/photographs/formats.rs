@@ -41,7 +41,7 @@ fn load(root: &Path) -> Dataset {
 }
 
 fn load_with(root: &Path, options: LoadOptions) -> Dataset {
-    load_with(root, options)
+    Dataset::load(root, &options).unwrap()
 }
 
 /// The dataset must be refused in one line that contains all of `parts`.
@@ -108,7 +108,7 @@ fn the_lom_layout_trains_on_low_and_scores_against_high() {
 #[test]
 fn a_validation_listing_replaces_a_missing_test_listing() {
     let folder = Folder::lom();
-    std::fs::remove_file(folder.join("transforms_test.json")).unwrap();
+    fs::remove_file(folder.join("transforms_test.json")).unwrap();
     assert_eq!(names(&load(&folder), Split::Test), ["v02"]);
 }
 
@@ -187,7 +187,7 @@ fn backslashes_and_frames_of_unknown_size_are_handled() {
 #[test]
 fn a_model_without_points_loads_without_points() {
     let folder = Folder::with_model(&model(9));
-    std::fs::remove_file(folder.join("sparse/0/points3D.bin")).unwrap();
+    fs::remove_file(folder.join("sparse/0/points3D.bin")).unwrap();
     let dataset = load(&folder);
     assert_eq!((dataset.views.len(), dataset.points.len()), (9, 0));
 }
@@ -258,7 +258,7 @@ fn photographs_and_references_are_undistorted_equally() {
         }
     };
     for (directory, gain) in [("low", 0.25), ("images", 1.0)] {
-        std::fs::create_dir(root.join(directory)).unwrap();
+        fs::create_dir(root.join(directory)).unwrap();
         for index in 0..9 {
             let path = root.join(directory).join(name(index)).with_extension("exr");
             Image::from_fn(SIZE.0, SIZE.1, pattern(gain)).save_exr(path).unwrap();
@@ -309,9 +309,9 @@ fn low_folders_are_the_input_and_normal_light_folders_the_reference() {
 #[test]
 fn a_list_of_test_names_decides_the_split() {
     let folder = Folder::with_model(&model(9));
-    std::fs::write(folder.join("test.txt"), "v03.png\n\n v05 \r\nunknown.png\n").unwrap();
+    fs::write(folder.join("test.txt"), "v03.png\n\n v05 \r\nunknown.png\n").unwrap();
     assert_eq!(names(&load(&folder), Split::Test), ["v03", "v05"]);
-    std::fs::rename(folder.join("test.txt"), folder.join("sparse/0/test.txt")).unwrap();
+    fs::rename(folder.join("test.txt"), folder.join("sparse/0/test.txt")).unwrap();
     assert_eq!(names(&load(&folder), Split::Test), ["v03", "v05"]);
 }
 
@@ -336,7 +336,7 @@ fn points_of_another_world_are_transformed_into_the_views() {
     let mut moved = model(10);
     for (_, pose, ..) in &mut moved.images {
         let center = pose.inverse().translation;
-        pose.matrix3 *= glam::DMat3::from_quat(rotation.inverse());
+        pose.matrix3 *= DMat3::from_quat(rotation.inverse());
         pose.translation = -(pose.matrix3 * elsewhere(center));
     }
     moved.points.iter_mut().for_each(|(_, position, _)| *position = elsewhere(*position));

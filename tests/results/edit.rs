@@ -1,19 +1,10 @@
 //! Edits of a model: what they keep, what they refuse, and that they repeat.
 
-use std::fs;
-
-use glam::{DAffine3, DMat3, DQuat, DVec3, Vec3};
-use nightsplat::gpu::testing::gpu;
 use nightsplat::splats::model::Model;
-use nightsplat::splats::render::{RenderOptions, Renderer};
-use nightsplat::splats::scene::{Gaussians, ply};
-use nightsplat_core::camera::Camera;
-use nightsplat_core::random::Stream;
-use nightsplat_photographs::image::Image;
 
 use crate::common::command::json;
 use crate::common::largest;
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 /// A cloud of Gaussians of degree 3 around the origin.
 fn cloud(count: usize, seed: u64) -> Model {
@@ -215,7 +206,7 @@ fn a_table_of_cameras_in_metres_scales_a_model_and_cameras_crop_it_wherever_it_i
     // 2.5 metres a unit, in a world of another origin.
     let listing = workspace.text("set/transforms_train.json");
     let listing = json(&listing);
-    let row = |frame: &serde_json::Value| {
+    let row = |frame: &Value| {
         let at = |row: usize| 2.5 * frame["transform_matrix"][row][3].as_f64().unwrap() + 100.0;
         let name = frame["file_path"].as_str().unwrap().rsplit('/').next().unwrap();
         format!("{name},{},{},{}\n", at(0), at(1), at(2))

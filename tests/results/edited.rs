@@ -1,14 +1,8 @@
 //! An edited or exported model is scored as its run is, edits say what they cost, and nothing bright is scored against
 //! dark photographs.
 
-use std::fs;
-
-use glam::Vec3;
-use nightsplat::splats::scene::{Gaussians, ply};
-use serde_json::Value;
-
 use crate::common::command::{json, says};
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 fn psnr(scores: &Value) -> f64 {
     scores["mean"]["psnr"].as_f64().unwrap()

@@ -1,17 +1,12 @@
 //! Floaters that were planted before the cameras are found, and a clean model keeps its Gaussians.
 
-use std::collections::BTreeSet;
-use std::fs;
+use glam::DMat4;
 
-use glam::{DMat4, DVec3, Vec3};
-use nightsplat::splats::scene::{Gaussians, ply};
-use nightsplat_core::random::Stream;
-
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 /// Gaussians at random places of random views of a listing, before what they show.
 fn floaters(listing: &str, count: usize) -> Gaussians {
-    let listing: serde_json::Value = serde_json::from_str(listing).unwrap();
+    let listing: Value = serde_json::from_str(listing).unwrap();
     let frames = listing["frames"].as_array().unwrap();
     let poses: Vec<DMat4> = frames
         .iter()

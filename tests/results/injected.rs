@@ -1,15 +1,11 @@
 //! Failures around a run: lost devices, full disks, deleted folders. Each has a defined outcome.
 #![cfg(unix)]
 
-use std::fs;
 use std::io::{BufRead, BufReader};
-use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
-
-use nightsplat::gpu::testing::gpu;
+use std::process::Child;
 
 use crate::common::command::{command, refused_with, run, succeed};
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 /// A running command in its own process group, as a shell would start it.
 fn begun(arguments: &str) -> Child {

@@ -1,12 +1,9 @@
 //! Light out of a run: the photographs' light, linear files, another size, exposures that vary.
 
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::ply;
-use nightsplat_photographs::image::{Image, ImageFile};
-use serde_json::Value;
 
 use crate::common::command::{json, says};
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 /// The arguments for training with the default curve into `run`.
 fn training(options: &str) -> String {
@@ -36,8 +33,8 @@ fn renders_are_written_and_scored_in_the_light_of_the_photographs() {
 
     let render = |out: &str, options: &str| {
         workspace.succeed(&format!("render @run --split test --out @{out} {options}"));
-        let file = std::fs::read_dir(workspace.path(out)).unwrap().next().unwrap().unwrap().path();
-        (std::fs::read(&file).unwrap(), Image::load(&file).unwrap())
+        let file = fs::read_dir(workspace.path(out)).unwrap().next().unwrap().unwrap().path();
+        (fs::read(&file).unwrap(), Image::load(&file).unwrap())
     };
     let mean = |image: &Image| image.data.iter().sum::<f32>() / image.data.len() as f32;
     let (_, target) = render("target", "");
@@ -150,9 +147,9 @@ fn a_set_of_varying_exposure_has_its_clean_references_and_the_same_bytes_for_a_s
 fn varied_exposures_of_a_dark_set_are_warned_of() {
     let workspace = Workspace::new();
     let set = workspace.path("set");
-    for photograph in std::fs::read_dir(set.join("low")).unwrap() {
+    for photograph in fs::read_dir(set.join("low")).unwrap() {
         let photograph = photograph.unwrap();
-        std::fs::copy(photograph.path(), set.join("high").join(photograph.file_name())).unwrap();
+        fs::copy(photograph.path(), set.join("high").join(photograph.file_name())).unwrap();
     }
     let (_, warned) = workspace.run("vary @set --out @out", 0);
     assert!(warned.contains("photographs are dark"), "{warned}");

@@ -1,16 +1,16 @@
 //! Runs that are interrupted, doubled, damaged or given another dataset: nothing is lost, nothing is mixed.
 #![cfg(unix)]
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{BufRead, BufReader};
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant, SystemTime};
+use std::process::Child;
+use std::time::SystemTime;
 
 use nightsplat::gpu::testing::not_run;
 
 use crate::common::command::{command, refused, run, succeed};
-use crate::common::workspace::{Workspace, log};
+use crate::common::prelude::*;
+use crate::common::workspace::log;
 
 /// A training that has started and has thousands of steps to go.
 fn begun(arguments: &str) -> Child {
@@ -231,7 +231,7 @@ fn foreign_files_are_neither_replaced_nor_resumed() {
     let workspace = Workspace::new();
     fs::create_dir(workspace.path("theirs")).unwrap();
     for (file, content) in [("config.toml", "title = \"my app\"\n"), ("train.csv", "a,b\n")] {
-        workspace.write("theirs").join(file, content);
+        workspace.write(&format!("theirs/{file}"), content);
         for held in ["--resume", "--overwrite"] {
             refused(&workspace.train("theirs", held), 1, &["theirs", "no config.toml"]);
         }
@@ -296,7 +296,7 @@ fn a_run_resumes_only_with_its_own_dataset() {
 fn a_relative_dataset_means_the_same_from_everywhere() {
     let workspace = Workspace::new();
     let train = "train set --out run --steps 2 --curve ap3 --plan none";
-    let output = command(train).current_dir(workspace.0.path()).output().unwrap();
+    let output = command(train).current_dir(&**workspace).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let eval = |config: &str| {
         workspace.write("run/config.toml", config);

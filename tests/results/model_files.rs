@@ -1,16 +1,11 @@
 //! Model files: as initial models, and rendered, scored and exported without a run.
 
-use std::fs;
-use std::path::Path;
-
-use glam::DVec3;
 use nightsplat::Error;
 use nightsplat::results::run::load_config;
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::{Gaussians, ply};
 
 use crate::common::command::{Folder, json, refused, run, succeed};
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 #[test]
 fn a_run_starts_from_a_model_and_its_highest_sh_degree() {
@@ -264,7 +259,7 @@ fn training_far_from_the_origin_of_the_world_says_what_positions_are_relative_to
     assert!(!near.contains("relative"), "{near}");
     for listing in ["transforms_train.json", "transforms_test.json"] {
         let path = workspace.path("set").join(listing);
-        let mut listed: serde_json::Value =
+        let mut listed: Value =
             serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
         for frame in listed["frames"].as_array_mut().unwrap() {
             let x = &mut frame["transform_matrix"][0][3];

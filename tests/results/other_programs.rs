@@ -1,12 +1,9 @@
 //! Pictures of other programs: renders that are scored like our own, targets that are trained on, formulas in sweeps.
 
-use std::fs;
-
-use nightsplat::train::TrainConfig;
-use nightsplat_photographs::image::{Image, ImageFile as _};
+use nightsplat_photographs::image::ImageFile as _;
 
 use crate::common::command::json;
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 #[test]
 fn renders_of_another_program_are_scored_like_our_own() {

@@ -1,11 +1,6 @@
 //! Layers, sizes, backgrounds and camera paths of renders.
 
-use std::fs;
-use std::path::Path;
-
-use nightsplat_photographs::image::{Image, ImageFile};
-
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 fn image(path: &Path) -> Image {
     Image::load(path).unwrap()
@@ -31,7 +26,7 @@ fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
     assert!(opaque.count() > 100);
     for layer in ["depth", "normal"] {
         let shown = image(&render(&format!("--layer {layer}"), layer));
-        let distinct: std::collections::BTreeSet<u32> =
+        let distinct: BTreeSet<u32> =
             shown.data.iter().map(|value| value.to_bits()).collect();
         assert!(distinct.len() > 20, "{layer}");
     }

@@ -1,14 +1,11 @@
 //! Runs from the user's view: without references, with another split, interrupted, opened elsewhere, rendered along a
 //! path, logged to `TensorBoard`.
 
-use std::fs;
-use std::path::PathBuf;
-
 use nightsplat::results::run::{load_progress, stopped_at};
-use nightsplat_photographs::image::{Image, ImageFile};
 
 use crate::common::command::{Folder, exists, file_names, json, refused_with, says, unwrapped};
 use crate::common::copy;
+use crate::common::prelude::*;
 
 /// A folder with a small dataset in `set`.
 fn folder() -> Folder {
@@ -200,9 +197,9 @@ fn a_model_is_written_with_every_checkpoint() {
     let out = folder.path("run");
     let options = "--steps 100000 --checkpoint-every 5 --curve ap3 --model plain --progress none";
     let mut child = folder.command(&train("run", options));
-    let mut child = child.stdout(std::process::Stdio::null()).spawn().unwrap();
+    let mut child = child.stdout(Stdio::null()).spawn().unwrap();
     while !out.join("model.ply").exists() && child.try_wait().unwrap().is_none() {
-        std::thread::sleep(std::time::Duration::from_millis(5));
+        std::thread::sleep(Duration::from_millis(5));
     }
     child.kill().unwrap();
     child.wait().unwrap();

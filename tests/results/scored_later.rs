@@ -1,14 +1,10 @@
 //! Scores that are asked for after a training: references found later, LPIPS of a sweep.
 
-use std::fs;
-use std::path::Path;
-
 use nightsplat::networks::lpips::Network;
-use serde_json::Value;
 
 use crate::common::command::json;
 use crate::common::lpips;
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 #[test]
 fn references_that_are_found_later_give_the_scores_of_a_dataset_that_had_them() {
@@ -55,7 +51,7 @@ fn a_sweep_adds_lpips_to_its_tables_and_scores_no_run_again() {
     let with = format!("{sweep} --lpips {}", weights.display());
     let (stdout, message) = workspace.run(&with, 0);
     assert!(stdout.contains("LPIPS") && !message.contains("finished"), "{stdout}\n{message}");
-    let runs = |folder: &Path| -> Vec<std::path::PathBuf> {
+    let runs = |folder: &Path| -> Vec<PathBuf> {
         let all = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
         all.filter(|path| path.join("model.ply").exists()).collect()
     };

@@ -1,20 +1,15 @@
 //! Streamed SOG: its index, its chunks, and what is refused.
 
-use std::fs;
 use std::io::{Cursor, Write as _};
-use std::path::Path;
 
-use glam::DVec3;
 use nightsplat::results::export::Provenance;
 use nightsplat::results::export::streamed::{self, Division, INDEX, TileLoader, Written};
 use nightsplat::splats::levels::level;
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::{Gaussians, ply};
-use nightsplat_core::random::Stream;
-use serde_json::Value;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
 use crate::common::command::{Folder, refused, succeed};
+use crate::common::prelude::*;
 
 /// Tiles of 300 and of 130 Gaussians side by side, each with an origin of its own.
 fn tiles() -> [Gaussians; 2] {

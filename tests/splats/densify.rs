@@ -3,18 +3,15 @@
 
 mod host;
 
-use glam::{DVec3, Quat, Vec3};
-use nightsplat::gpu::testing::gpu;
+use glam::Quat;
 use nightsplat::splats::densify::{
     Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, Round,
 };
-use nightsplat::splats::optimizer::Moments;
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
-use nightsplat::splats::scene::{DeviceGaussians, Layout};
-use nightsplat_core::camera::Camera;
+use nightsplat::splats::scene::DeviceGaussians;
 
 use host::{COLUMNS, CONSERVING, Host, LAST, SETTINGS, camera_at, room_for, shape};
+
+use crate::common::prelude::*;
 
 #[test]
 fn density_control_matches_its_references() {

@@ -1,13 +1,14 @@
 //! Adam: the kernel against its reference, its guards, and a minimisation.
 
-use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{Gpu, Reference};
+use nightsplat::gpu::Reference;
 use nightsplat::kernels::adam;
 use nightsplat::splats::attributes::Attribute;
 use nightsplat::splats::attributes::PlaneCounts;
 use nightsplat::splats::optimizer::{
-    Adam, AdamBuffers, AdamStep, FiniteCheck, LearningRates, Moments, Schedule,
+    Adam, AdamBuffers, AdamStep, FiniteCheck, LearningRates, Schedule,
 };
+
+use crate::common::prelude::*;
 
 /// Two features and SH of degree 1.
 const COLUMNS: u32 = 25;

@@ -2,17 +2,16 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_with};
+use nightsplat::gpu::testing::gpu_that_binds;
 use nightsplat::splats::optimizer::LearningRates;
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
-use nightsplat::splats::scene::{DeviceGaussians, Shape, width};
-use nightsplat::train::{PrecisionConfig, TrainConfig, Trainer};
+use nightsplat::splats::render::{Damping, Gradients};
+use nightsplat::splats::scene::{DeviceGaussians, width};
+use nightsplat::train::PrecisionConfig;
 
 use crate::common::own_gpu;
-use crate::common::setup::{Setup, features};
-use crate::common::train::{advance, dataset};
+use crate::common::prelude::*;
+use crate::common::setup::features;
+use crate::common::train::dataset;
 use crate::learned::{Learned, wave};
 
 /// Formats of SH coefficients and of moments.

@@ -1,21 +1,13 @@
 //! The parts of LITA-GS: each alone and all together, trained, saved, and rendered.
 
-use std::path::Path;
-use std::sync::OnceLock;
-
-use nightsplat::gpu::testing::gpu;
 use nightsplat::loss::Term;
-use nightsplat::networks::{DenoiserSettings, NetworkVariant};
 use nightsplat::splats::attributes::{ATTRIBUTES, Attribute, AttributeSpec};
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::Gaussians;
-use nightsplat::train::{Part, Rendered, StepReport, TrainConfig, Trainer};
-use nightsplat_photographs::dataset::Dataset;
-use nightsplat_photographs::image::{Image, ImageFile};
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::train::{Part, Rendered, StepReport};
 
 use crate::common::command::{Folder, json, says};
-use crate::common::train::{small_set, train};
+use crate::common::prelude::*;
+use crate::common::train::train;
 
 /// Six views of 40 x 30 pixels, with depth maps if requested.
 fn make_set(folder: &Path, with_depth: bool) {
@@ -23,10 +15,10 @@ fn make_set(folder: &Path, with_depth: bool) {
     nightsplat_synth::write(folder, &options).unwrap();
     if with_depth {
         let depth = folder.join("depth");
-        std::fs::create_dir(&depth).unwrap();
+        fs::create_dir(&depth).unwrap();
         // Half the size, as estimators return it; a plane that recedes upwards.
         let map = Image::from_fn(20, 15, |x, y| [1.0 - (y as f32 + 0.1 * x as f32) / 20.0; 3]);
-        for file in std::fs::read_dir(folder.join("low")).unwrap() {
+        for file in fs::read_dir(folder.join("low")).unwrap() {
             let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
             map.save_png16(depth.join(format!("depth_{name}.png"))).unwrap();
         }
@@ -253,9 +245,9 @@ fn depth_maps_are_found_resized_negated_and_left_out_if_they_are_constant() {
 fn float_depth_keeps_its_values_and_its_sign() {
     let folder = folder(false);
     let maps = folder.join("estimates");
-    std::fs::create_dir(&maps).unwrap();
+    fs::create_dir(&maps).unwrap();
     let map = Image::from_fn(40, 30, |x, _| [x as f32 - 20.0; 3]);
-    for file in std::fs::read_dir(folder.join("low")).unwrap() {
+    for file in fs::read_dir(folder.join("low")).unwrap() {
         let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
         map.save_exr_as_stored(maps.join(format!("{name}.exr"))).unwrap();
     }
@@ -331,7 +323,7 @@ fn a_run_with_networks_is_saved_scored_and_rendered_layer_by_layer() {
     ] {
         let options = format!("--split test --out @{layer} --layer {layer} --format {format}");
         folder.succeed(&format!("render @run {options}"));
-        let file = std::fs::read_dir(folder.path(layer)).unwrap().next().unwrap().unwrap().path();
+        let file = fs::read_dir(folder.path(layer)).unwrap().next().unwrap().unwrap().path();
         assert_eq!(Image::size_of(file).unwrap(), (40, 30), "{layer}");
     }
 

@@ -1,21 +1,13 @@
 //! Interrupted runs that are resumed.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::Stdio;
-use std::time::Duration;
-
-use glam::Vec3;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::results::run::{self, Event, IfExists};
 use nightsplat::splats::scene::Attribute;
-use nightsplat::train::{Background, EndReason, Part, StepReport, TrainConfig, Trainer};
-use nightsplat_photographs::dataset::{Dataset, Split, View};
-use nightsplat_photographs::image::Image;
+use nightsplat::train::{Background, EndReason, Part, StepReport};
+use nightsplat_photographs::dataset::View;
 use safetensors::SafeTensors;
 
 use crate::common::command::{command, refused, succeed};
-use crate::common::train::{advance, small_set};
+use crate::common::prelude::*;
 use crate::common::workspace::log;
 
 /// A dataset of nine small views.

@@ -1,14 +1,9 @@
 //! The table of hostile inputs.
 
-use glam::Vec3;
 use nightsplat::Result;
-use nightsplat::gpu::Gpu;
-use nightsplat::splats::render::RenderSettings;
-use nightsplat::splats::scene::Gaussians;
-use nightsplat_core::random::Stream;
-use nightsplat_photographs::tone::ToneSettings;
 
 use super::hostile::{Hostile, camera_of_focal};
+use crate::common::prelude::*;
 
 /// An input and its expected outcome.
 #[derive(Debug)]

@@ -68,7 +68,7 @@ fn the_cameras_of_a_rig_may_have_equal_file_names() {
     let all: Vec<&str> = dataset.views.iter().map(|view| view.name.as_str()).collect();
     assert_eq!(all, ["a_000", "a_001", "a_002", "a_003", "b_000", "b_001", "b_002", "b_003"]);
     assert_eq!(names(&dataset, Split::Test), ["a_001", "b_003"]);
-    let level = |name: &str| super::level(view(&dataset, name).image.as_ref()).unwrap();
+    let level = |name: &str| level(view(&dataset, name).image.as_ref()).unwrap();
     assert_eq!([level("a_000"), level("b_000"), level("a_001")], [10.0, 11.0, 12.0]);
     assert!(dataset.points.iter().any(|point| point.views.len() > 2));
     // The same names in one listing of a transforms file.
@@ -123,7 +123,7 @@ fn a_rational_lens_is_undistorted_on_load_and_a_fisheye_on_request() {
         assert_eq!(camera.model, CameraModel::Pinhole, "{name}");
         assert!(camera.focal.is_finite() && camera.focal.x != 22.0, "{name}: {camera:?}");
         // No blank pixel: every photograph has a single colour.
-        assert_eq!(super::level(view(&binary, "v04").image.as_ref()), Some(14.0), "{name}");
+        assert_eq!(level(view(&binary, "v04").image.as_ref()), Some(14.0), "{name}");
         assert_eq!(text.views[0].camera, camera, "{name}");
     }
 }

@@ -102,15 +102,12 @@ fn one_grey_card_balances_every_photograph_cached_or_not() {
 fn an_invalid_white_balance_is_refused_in_one_line() {
     let root = &Folder::empty();
     lamp_lit(root);
-    let out = root.join("run");
     for (white, code, part) in [
         ("0,1,1", 2, "white_balance (--white-balance) is \"0,1,1\"; it must be R,G,B"),
         ("warm", 2, "(--white-balance) is \"warm\""),
         ("v99,2,2,5,5", 3, "no photograph is called `v99`"),
         ("v03,39,2,5,5", 2, "it exceeds the photograph, which is 40x30"),
     ] {
-        let arguments =
-            format!("train {} --out {} --white-balance {white}", root.display(), out.display());
-        refused(&arguments, code, &[part]);
+        root.refused(&format!("train @ --out @run --white-balance {white}"), code, &[part]);
     }
 }

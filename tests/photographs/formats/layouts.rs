@@ -14,7 +14,7 @@ fn assert_whole(dataset: &Dataset, what: &str) {
     assert!(dataset.skipped.is_empty(), "{what}: {:?}", dataset.skipped);
     for (index, view) in dataset.views.iter().enumerate() {
         assert_camera_is_view(view, index);
-        assert_eq!(super::level(view.image.as_ref()), Some(10.0 + index as f32), "{what}");
+        assert_eq!(level(view.image.as_ref()), Some(10.0 + index as f32), "{what}");
     }
     assert_eq!(dataset.points.len(), 20, "{what}");
     assert_eq!(dataset.points[1].views, [2, 5, 8], "{what}");
@@ -105,7 +105,7 @@ fn cameras_of_a_network_s_input_are_scaled_for_each_axis() {
     let lines = warnings(|| {
         let camera = load(&of_input(392.0)).views[0].camera;
         assert_eq!((camera.width, camera.height), (500, 375));
-        assert!((camera.focal - glam::DVec2::new(500.0, 375.0)).length() < 1e-9, "{camera:?}");
+        assert!((camera.focal - DVec2::new(500.0, 375.0)).length() < 1e-9, "{camera:?}");
     });
     says(&lines, &["9 cameras are of a network's input"]);
     refuses(&of_input(518.0), &["its camera is 518x518", "padded or cropped"]);
@@ -329,7 +329,7 @@ fn an_archive_is_read_in_place() {
     // Also photographs that are read again.
     let dataset = load_with(&zip, LoadOptions { keep: Some(0), ..Default::default() });
     let image = dataset.views[3].loaded().unwrap();
-    assert_eq!(super::level(image.as_deref()), Some(13.0));
+    assert_eq!(level(image.as_deref()), Some(13.0));
     assert_eq!(fs::read_dir(&folder).unwrap().count(), 2, "something was unpacked");
     // Listed files outside the archive are not read.
     let outside = folder.join("outside.png");
@@ -389,8 +389,8 @@ fn black_borders_of_undistorted_photographs_are_masked_but_not_those_of_a_dark_s
     assert_eq!(Diagnosis::new(&dataset, &options).unwrap(), loaded);
     {
         let apply = format!("tone apply {} --curve ap3 --json", folder.display());
-        let (report, _) = crate::common::command::run(&apply, 0);
-        let report: serde_json::Value = serde_json::from_str(&report).unwrap();
+        let (report, _) = run(&apply, 0);
+        let report: Value = serde_json::from_str(&report).unwrap();
         let p10 = report["views"]["v00"]["p10"].as_f64().unwrap();
         assert!(p10 > 0.03, "{report}");
     }

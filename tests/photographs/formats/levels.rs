@@ -7,7 +7,7 @@ use super::*;
 /// A dataset of 17 photographs in 16 bits, of codes by photograph and pixel.
 fn set(code: impl Fn(usize, u32) -> u16) -> Folder {
     let root = Folder::empty();
-    std::fs::create_dir(root.join("images")).unwrap();
+    fs::create_dir(root.join("images")).unwrap();
     for index in 0..17 {
         let path = root.join("images").join(name(index)).with_extension("png");
         let pixel = |x, y| Rgb([code(index, SIZE.0 * y + x); 3]);
@@ -56,7 +56,7 @@ fn a_photograph_beyond_the_levels_that_others_show_restores_those_of_the_format(
 #[test]
 fn photographs_of_linear_light_are_shrunk_in_light() {
     let root = Folder::empty();
-    std::fs::create_dir(root.join("images")).unwrap();
+    fs::create_dir(root.join("images")).unwrap();
     let light = |x, y| if (x + 3 * y) % 4 == 0 { 0.09 } else { -0.01 };
     for index in 0..9 {
         let path = root.join("images").join(name(index)).with_extension("exr");

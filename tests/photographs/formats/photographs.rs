@@ -104,12 +104,8 @@ fn heic_is_refused_with_its_converter_and_listed_as_unread() {
     let root = &Folder::empty();
     fs::write(root.join("a.heic"), b"\0\0\0\x18ftypheic\0\0\0\0mif1heic").unwrap();
     photograph(&root.join("b.png"), SIZE, 0.1);
-    refused(
-        &format!("tone apply {}/a.heic", root.display()),
-        3,
-        &["a.heic", "HEIC", "heif-convert", "sips"],
-    );
-    let (_, message) = run(&format!("tone apply {}", root.display()), 0);
+    root.refused("tone apply @a.heic", 3, &["a.heic", "HEIC", "heif-convert", "sips"]);
+    let (_, message) = root.run("tone apply @", 0);
     says(&message, &["not read: 1 .heic", "heif-convert"]);
 }
 
@@ -260,19 +256,19 @@ fn a_mask_of_another_aspect_ratio_is_refused_and_a_full_mask_excludes_its_view()
     );
     half_mask(&root.join("masks/v01.png"), (30, 30));
     refuses(root, &["masks/v01.png: is 30x30, its photograph 40x30"]);
-    refused(&format!("diagnose {}", root.display()), 3, &["masks/v01.png"]);
+    root.refused("diagnose @", 3, &["masks/v01.png"]);
 }
 
 #[test]
 fn masked_pixels_are_not_in_the_statistics_of_tone() {
     let root = &Folder::empty();
-    let measured = |more: &str| -> serde_json::Value {
+    let measured = |more: &str| -> Value {
         let (stdout, _) = run(&format!("tone apply {} --json{more}", root.display()), 0);
         serde_json::from_str(&stdout).unwrap()
     };
     let halves = |x: u32, _| [if 2 * x < SIZE.0 { 0.1 } else { 0.9 }; 3];
     Image::from_fn(SIZE.0, SIZE.1, halves).save_png8(root.join("a.png")).unwrap();
-    let mean = |json: &serde_json::Value| (json["scene"]["mean"].as_f64().unwrap() * 100.0).round();
+    let mean = |json: &Value| (json["scene"]["mean"].as_f64().unwrap() * 100.0).round();
     assert_eq!(mean(&measured("")), 50.0);
     half_mask(&root.join("masks/a.png"), SIZE);
     assert_eq!(mean(&measured("")), 10.0);

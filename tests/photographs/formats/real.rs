@@ -123,11 +123,11 @@ fn twenty_three_cameras_of_different_sizes_load_in_one_dataset() {
 fn the_fox_splits_by_its_list_and_scores_against_normal_light() {
     let Some(root) = shared("data/fox") else { return };
     let dataset = load(&root);
-    let listed = std::fs::read_to_string(root.join("test.txt")).unwrap();
+    let listed = fs::read_to_string(root.join("test.txt")).unwrap();
     let listed: Vec<_> = listed.lines().map(|line| line.trim_end_matches(".png")).collect();
     assert_eq!((dataset.views.len(), names(&dataset, Split::Test)), (50, listed.clone()));
     let test = view(&dataset, listed[0]);
-    let mean = |image: &nightsplat_photographs::image::Image| {
+    let mean = |image: &Image| {
         image.data.iter().sum::<f32>() / image.data.len() as f32
     };
     let (low, normal) =

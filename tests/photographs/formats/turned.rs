@@ -73,7 +73,7 @@ fn capture(root: &Path, size: (u32, u32), turn: (u8, u8), of_exif: bool, has_poi
         let stored = if of_exif { turned(image, turn.1) } else { image };
         write(&stored, &path);
         orient(&path, turn.0);
-        let (q, t) = (glam::DQuat::from_mat3(&pose(index).matrix3), pose(index).translation);
+        let (q, t) = (DQuat::from_mat3(&pose(index).matrix3), pose(index).translation);
         let numbers = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|number| number.to_string());
         images += &format!("{} {} 1 {}.jpg\n\n", index + 1, numbers.join(" "), name(index));
     }

@@ -1,17 +1,16 @@
 //! Gaussians in host memory, and density control of them on the device and in its references.
 
-use glam::{DAffine3, DVec2, DVec3, Vec3};
-use nightsplat::gpu::{Gpu, Reference};
+use nightsplat::gpu::Reference;
 use nightsplat::kernels::densify_action::{KEY_KEEP, KEY_PRUNE};
 use nightsplat::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
 use nightsplat::splats::batches::Batches;
 use nightsplat::splats::densify::{
     Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, LARGEST_CHANGE, Round,
 };
-use nightsplat::splats::optimizer::Moments;
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::scene::{DeviceGaussians, Features, GaussianSlice, Layout, Shape, width};
-use nightsplat_core::camera::{Camera, CameraModel, Patch};
+use nightsplat::splats::scene::{DeviceGaussians, GaussianSlice, width};
+use nightsplat_core::camera::Patch;
+
+use crate::common::prelude::*;
 
 /// Four features and SH of degree 1.
 pub(super) const COLUMNS: usize = 27;
