@@ -238,8 +238,7 @@ fn scene_statistics_give_every_photograph_one_curve() {
 fn a_dataset_is_measured_on_training_views_and_scored_on_test_views() {
     let dir = tempfile::tempdir().unwrap();
     let set = dir.path().join("set");
-    let options =
-        SyntheticOptions { width: 48, height: 36, ..Default::default() };
+    let options = SyntheticOptions { width: 48, height: 36, ..Default::default() };
     nightsplat_synth::write(&set, &options).unwrap();
     let output = apply(&automatic(&set, "--curve ap3")).unwrap();
     assert!(output.scene.scores.is_some());

@@ -259,8 +259,7 @@ fn training_far_from_the_origin_of_the_world_says_what_positions_are_relative_to
     assert!(!near.contains("relative"), "{near}");
     for listing in ["transforms_train.json", "transforms_test.json"] {
         let path = workspace.path("set").join(listing);
-        let mut listed: Value =
-            serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+        let mut listed: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
         for frame in listed["frames"].as_array_mut().unwrap() {
             let x = &mut frame["transform_matrix"][0][3];
             *x = (x.as_f64().unwrap() + 448_262.5).into();

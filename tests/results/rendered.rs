@@ -26,8 +26,7 @@ fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
     assert!(opaque.count() > 100);
     for layer in ["depth", "normal"] {
         let shown = image(&render(&format!("--layer {layer}"), layer));
-        let distinct: BTreeSet<u32> =
-            shown.data.iter().map(|value| value.to_bits()).collect();
+        let distinct: BTreeSet<u32> = shown.data.iter().map(|value| value.to_bits()).collect();
         assert!(distinct.len() > 20, "{layer}");
     }
     let near = image(&render("--layer depth --depth-range 0,0.001", "near"));

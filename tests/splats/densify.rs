@@ -25,14 +25,12 @@ fn density_control_matches_its_references() {
     for (settings, count) in cases {
         let before = Host::mixed(count);
         let round = Round { rounds_left: 3, ..LAST };
-        let (actual, report) = before.densify_seen_from(&cameras, &gpu, settings, round);
-        let expected = before.reference(&cameras, settings, round);
-        assert_eq!(actual.count, expected.count, "{report:?}");
-        assert_eq!((&actual.first, &actual.second), (&expected.first, &expected.second));
-        for (i, (a, b)) in actual.parameters.iter().zip(&expected.parameters).enumerate() {
-            // Only means, scales and opacities are computed; exp, log and cos are accurate to about 1e-5 here.
-            let tolerance = if i < 11 * actual.count { 2e-5 } else { 0.0 };
-            assert!((a - b).abs() <= tolerance, "{count} Gaussians, float {i}: {a} {b}");
+        let ((_, report), passes) =
+            gpu.checked(|| before.densify_seen_from(&cameras, &gpu, settings, round));
+        passes.agree().unwrap_or_else(|error| panic!("{count} Gaussians, {settings:?}: {error}"));
+        for kernel in ["densify_score", "densify_decide", "densify_scatter", "densify_moments"] {
+            let ran = passes.passes.iter().any(|pass| pass.kernel == kernel);
+            assert!(ran || count == 0, "{count} Gaussians: no {kernel}");
         }
         if settings == SETTINGS && count == 1000 {
             assert!(report.cloned > 100 && report.split > 50 && report.pruned > 100, "{report:?}");

@@ -61,8 +61,7 @@ fn a_view_with_not_finite_values_is_left_out_and_the_run_continues_to_the_same_b
         let checkpoint = folder.path().join("checkpoint.safetensors");
         trainer.save_checkpoint(&checkpoint).unwrap();
         let reports = advance(&mut trainer, 30);
-        let views: BTreeSet<&str> =
-            reports.iter().map(|report| report.view.as_str()).collect();
+        let views: BTreeSet<&str> = reports.iter().map(|report| report.view.as_str()).collect();
         let all = dataset.train_views().count();
         assert_eq!(views.len(), all - 1, "{views:?}");
         let mut resumed = new();

@@ -234,8 +234,7 @@ fn the_command_reports_the_lamp_as_text_json_and_page() {
         assert!(whole.contains(part), "{text}");
     }
     assert!(fs::read_to_string(page).unwrap().contains("moves with the camera"));
-    let json: Value =
-        serde_json::from_str(&succeed(&format!("diagnose {root} --json"))).unwrap();
+    let json: Value = serde_json::from_str(&succeed(&format!("diagnose {root} --json"))).unwrap();
     let lamp = &json["scene"]["lamp"];
     for key in ["exponent", "ambient", "d_ref", "r_squared", "stops", "exposure_r_squared"] {
         assert!(lamp[key].is_f64(), "{key} of {lamp}");

@@ -127,9 +127,7 @@ fn the_fox_splits_by_its_list_and_scores_against_normal_light() {
     let listed: Vec<_> = listed.lines().map(|line| line.trim_end_matches(".png")).collect();
     assert_eq!((dataset.views.len(), names(&dataset, Split::Test)), (50, listed.clone()));
     let test = view(&dataset, listed[0]);
-    let mean = |image: &Image| {
-        image.data.iter().sum::<f32>() / image.data.len() as f32
-    };
+    let mean = |image: &Image| image.data.iter().sum::<f32>() / image.data.len() as f32;
     let (low, normal) =
         (mean(test.image.as_ref().unwrap()), mean(test.reference.as_ref().unwrap()));
     assert!(low < 0.5 * normal, "{low} is not dark beside {normal}");
