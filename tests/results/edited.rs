@@ -109,10 +109,7 @@ fn an_edit_of_a_run_says_what_it_costs_and_warns_of_a_loss() {
     assert!((before - psnr(&of_run)).abs() < 0.02 && (after - before).abs() < 0.1, "{stdout}");
     assert!(stdout.contains("test views against their pseudo-GT: "), "{stdout}");
     assert!(!message.contains("loses"), "{message}");
-    assert!(
-        stdout.contains(&format!("out.ply --dataset {} --format html", path("set"))),
-        "{stdout}"
-    );
+    says(&stdout, &[&format!("out.ply --dataset {} --format html", path("set"))]);
     // Half of the model.
     let (stdout, message) = edit("--crop -100,-100,-100,0,100,100");
     let [before, after] = before_and_after(&stdout);

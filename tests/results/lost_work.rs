@@ -8,7 +8,7 @@ use std::time::SystemTime;
 
 use nightsplat::gpu::testing::not_run;
 
-use crate::common::command::{command, refused, run, succeed};
+use crate::common::command::{command, refused, run, says, succeed};
 use crate::common::prelude::*;
 use crate::common::workspace::log;
 
@@ -256,10 +256,7 @@ fn a_damaged_checkpoint_is_reported_and_the_previous_one_resumes_to_the_same_bit
     for damaged in [&flipped[..], &whole[..whole.len() - 7], b""] {
         fs::write(&checkpoint, damaged).unwrap();
         let (_, stderr) = run(&workspace.train("run", &format!("{options} --resume")), 0);
-        assert!(
-            stderr.contains("checkpoint.safetensors") && stderr.contains("previous checkpoint"),
-            "{stderr}"
-        );
+        says(&stderr, &["checkpoint.safetensors", "previous checkpoint"]);
         assert!(workspace.read("run/model.ply") == expected);
         fs::remove_file(workspace.path("run/done.json")).unwrap();
     }

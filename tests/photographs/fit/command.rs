@@ -7,6 +7,7 @@ use nightsplat_photographs::image::ImageFile as _;
 use nightsplat_photographs::tone::CurveChoice;
 
 use super::*;
+use crate::common::command::says;
 
 fn args(pairs: &[PathBuf]) -> FitArgs {
     FitArgs {
@@ -99,9 +100,7 @@ fn a_formula_is_fitted_within_its_bounds_and_written_for_other_commands() {
     let choice: CurveChoice = out.to_str().unwrap().parse().unwrap();
     assert_eq!(choice.settings().unwrap(), fitted.fit.settings.clone().rounded());
     let written = fs::read_to_string(&out).unwrap();
-    for part in ["# a*t/(t+b)\n", "curve = \"a*t/(t+b)\"", "[bounds]", "b = [0.01, 5.0]"] {
-        assert!(written.contains(part), "no {part} in {written}");
-    }
+    says(&written, &["# a*t/(t+b)\n", "curve = \"a*t/(t+b)\"", "[bounds]", "b = [0.01, 5.0]"]);
     assert!(fs::read_to_string(plot).unwrap().contains("a*t/(t+b) fitted"));
     // What was fitted is where the next fit starts.
     let again = FitArgs { family: out.to_str().unwrap().parse().unwrap(), ..args };

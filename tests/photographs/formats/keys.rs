@@ -181,12 +181,12 @@ fn keys_that_are_not_supported_are_named_in_one_line() {
     });
     let lines = warnings(|| drop(load(&folder)));
     assert_eq!(lines.lines().count(), 1, "{lines}");
-    assert!(
-        lines.contains(
+    says(
+        &lines,
+        &[
             "normal_path (9 times, normals/0.png the first), rolling_shutter ([0.0,0.1]), semantics_file \
-             (classes.json)"
-        ),
-        "{lines}"
+             (classes.json)",
+        ],
     );
 }
 
