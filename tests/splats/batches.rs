@@ -200,7 +200,7 @@ fn training_as_on_a_gpu_gives_the_bits_of_training_as_on_a_cpu() {
         (config.precision.rest, config.precision.moments) = (rest, moments);
         let train = |gpu: &Gpu| {
             let mut trainer = Trainer::new(gpu, config.clone(), &dataset).unwrap();
-            advance(&mut trainer, 30);
+            advance(&mut trainer, 23);
             trainer.gaussians().unwrap()
         };
         let expected = train(&gpu());
