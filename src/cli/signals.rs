@@ -1,5 +1,5 @@
-//! Signals to a run: SIGINT, SIGTERM and SIGHUP save and stop, another a second later or more ends the process at once,
-//! SIGUSR1 saves and continues, SIGUSR2 lets the run cool down and finish.
+//! Signals to a run: SIGINT, SIGTERM and SIGHUP save and stop, another a second later or more ends the process at once.
+//! SIGXCPU saves and stops, too. SIGUSR1 saves and continues, SIGUSR2 lets the run cool down and finish.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -30,7 +30,12 @@ pub(super) fn requests() -> Result<Requests> {
     let requests = Requests::default();
     let stops = stops();
     end_on_the_second(stops).map_err(refused)?;
-    for &(signal, cause) in stops {
+    // It comes every second from the soft limit of processor time on (`ulimit -St`), so it is no second signal.
+    #[cfg(unix)]
+    let out_of_time = [(signal_hook::consts::SIGXCPU, Stop::TimeUp)];
+    #[cfg(not(unix))]
+    let out_of_time = [];
+    for &(signal, cause) in stops.iter().chain(&out_of_time) {
         let stop = Arc::clone(requests.stop_flag());
         flag::register_usize(signal, stop, Requests::code(cause)).map_err(refused)?;
     }

@@ -37,17 +37,16 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::{Error, Result};
-use geometry::SceneGeometry;
 pub(super) use geometry::exposures_at_points;
 pub(crate) use geometry::median;
+use geometry::{SceneGeometry, deviation};
 pub use lamp::{LampDiagnosis, bands::BandsDiagnosis, falloff::FalloffDiagnosis};
 use lamp::{LampObservations, shading};
 pub use noise::ChannelNoise;
-use photograph::PhotographStatistics;
+use photograph::{PhotographStatistics, darkening};
 pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
 pub(crate) use remarks::remarks_at_points;
 pub use scene::SceneDiagnosis;
-use scene::{darkening, deviation};
 pub use target_noise::TargetNoise;
 
 /// Whether edges of this width are blurred, given the median width of the photographs.

@@ -166,6 +166,17 @@ fn a_closed_terminal_saves_and_stops_unless_the_run_was_started_to_outlive_it() 
 }
 
 #[test]
+fn a_run_out_of_processor_time_saves_and_asks_to_be_repeated() {
+    let workspace = Workspace::new();
+    let endless = "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0";
+    let child = begun(&workspace.train("run", endless));
+    send("-XCPU", &child);
+    let (code, stderr) = ended(child);
+    assert!(code == 75 && stderr.contains("(its time was up), saved"), "{code}: {stderr}");
+    assert!(workspace.path("run/checkpoint.safetensors").exists());
+}
+
+#[test]
 fn a_run_whose_time_is_up_asks_to_be_repeated_and_a_finished_one_does_not() {
     let workspace = Workspace::new();
     // The time is checked when the ledger is written: on any fast device, that is before the last step. A slow device

@@ -305,7 +305,7 @@ pub enum Stop {
     Terminated,
     /// SIGHUP, from a terminal or connection that has gone; the exit code is 129.
     HungUp,
-    /// `max_minutes` are over; the exit code is 75, on which schedulers repeat a job.
+    /// `max_minutes` are over, or SIGXCPU came; the exit code is 75, on which schedulers repeat a job.
     TimeUp,
 }
 

@@ -260,6 +260,15 @@ pub(crate) fn median(mut values: Vec<f64>) -> Option<f64> {
     Some((lower + values[middle]) / 2.0)
 }
 
+/// The standard deviation; `None` for fewer than two values.
+pub(super) fn deviation(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let values: Vec<f64> = values.collect();
+    let count = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / count;
+    let variance = values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count;
+    (values.len() >= 2).then(|| variance.sqrt())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -20,6 +20,7 @@ use self::bands::BandsDiagnosis;
 use self::falloff::FalloffDiagnosis;
 pub(super) use self::fit::LampObservations;
 use self::fit::{ALL, ANGLE, LOG_LINEAR, NOTHING};
+use super::geometry::deviation;
 
 /// A lamp is learned if it explains at least this fraction of the variance that exposures leave.
 const MIN_SHARE: f64 = 0.2;
@@ -116,7 +117,7 @@ impl LampDiagnosis {
             lamp_r_squared: share(left.by_lamp),
             spread: left.total.sqrt(),
             distance_stops: stops(left.by_angle, left.by_both),
-            exposure_spread: super::deviation(fit.exposures.into_iter().flatten()).unwrap_or(0.0),
+            exposure_spread: deviation(fit.exposures.into_iter().flatten()).unwrap_or(0.0),
             points: rows.groups.len(),
         })
     }

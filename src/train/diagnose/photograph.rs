@@ -1,11 +1,12 @@
 //! Measurements of one photograph, as stored: brightness, code values, noise, blur.
 
-use nightsplat_photographs::image::{Image, Mask, linear_from_srgb};
+use nightsplat_photographs::image::{Image, MIDDLE_GREY, Mask, linear_from_srgb};
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{
     MeasuredPhotograph, NEAR_WHITE, ToneSettings, bounded, luminance, measurable,
 };
 
+use super::geometry::deviation;
 use super::noise::{self, ChannelNoise, NoisePatch};
 use super::sharpness;
 use super::target_noise::{TargetNoise, target_noise};
@@ -14,6 +15,11 @@ use super::target_noise::{TargetNoise, target_noise};
 const BLUR_SIDE: u32 = 640;
 /// Columns and rows of the regions whose light is compared.
 const REGIONS: [usize; 2] = [8, 6];
+
+/// The factor of light to a metered exposure, for a photograph of this mean light.
+pub(super) fn darkening(light: f64) -> f64 {
+    f64::from(MIDDLE_GREY) / light.max(f64::MIN_POSITIVE)
+}
 
 /// Measurements of one photograph; fractions are over the values of all channels.
 #[derive(Clone, Debug)]
@@ -148,5 +154,5 @@ fn unevenness(luminance: &[f32], width: usize) -> f64 {
     let whole = means.iter().sum::<f64>() / means.len() as f64;
     // Regions are clamped at a thousandth of the mean, so that a black corner does not dominate.
     let logs: Vec<f64> = means.iter().map(|mean| mean.max(1e-3 * whole).log2()).collect();
-    super::deviation(logs.iter().copied()).filter(|_| whole > 0.0).unwrap_or(0.0)
+    deviation(logs.iter().copied()).filter(|_| whole > 0.0).unwrap_or(0.0)
 }

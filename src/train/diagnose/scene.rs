@@ -1,15 +1,15 @@
 //! The diagnosis of all photographs together.
 
-use nightsplat_photographs::image::{MIDDLE_GREY, srgb_from_linear};
+use nightsplat_photographs::image::srgb_from_linear;
 use nightsplat_photographs::tone::Exposure;
 use serde::Serialize;
 
-use super::geometry::{SceneGeometry, median};
+use super::geometry::{SceneGeometry, deviation, median};
 use super::lamp::bands::BandsDiagnosis;
 use super::lamp::falloff::FalloffDiagnosis;
 use super::lamp::{LampDiagnosis, LampObservations};
 use super::noise::{self, ChannelNoise};
-use super::photograph::PhotographStatistics;
+use super::photograph::{PhotographStatistics, darkening};
 use super::{TargetNoise, ViewDiagnosis};
 
 /// The diagnosis of all training photographs except black ones; means over the views unless stated otherwise.
@@ -120,11 +120,6 @@ impl SceneDiagnosis {
     }
 }
 
-/// The factor of light to a metered exposure, for a photograph of this mean light.
-pub(super) fn darkening(light: f64) -> f64 {
-    f64::from(MIDDLE_GREY) / light.max(f64::MIN_POSITIVE)
-}
-
 /// The noise of a target at the mean light, averaged over the views of a point.
 fn target_noise(
     noise: ChannelNoise,
@@ -140,13 +135,4 @@ fn target_noise(
     let slope = (soft(encoded + step) - soft(encoded - step)) / (2.0 * step);
     let slope = weight * slope + (1.0 - weight);
     slope * noise.deviation(light) / noise::slope(light) / shared.views_per_point.max(1.0).sqrt()
-}
-
-/// The standard deviation; `None` for fewer than two values.
-pub(super) fn deviation(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let values: Vec<f64> = values.collect();
-    let count = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / count;
-    let variance = values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count;
-    (values.len() >= 2).then(|| variance.sqrt())
 }
