@@ -14,8 +14,8 @@ is a fair sample.
   unviable     it does not compile
   unplanted    not a whole body: in a const function, of an unnamed type, or a field left at its default
 
-A mutant's tests end with the first that fails; --every runs all that reach it, and prints and writes the table of kills,
-target/kills/mutants.json: every test that fails for each mutant, and the tests that are not needed.
+A mutant's tests end with the first that fails; --every runs all that reach it, and prints and writes the table of
+kills, target/kills/mutants.json: every test that fails for each mutant, and the tests that are not needed.
 
 Needs `cargo install cargo-mutants --locked`. Exit code 1 if a mutant was missed.
 """
