@@ -127,6 +127,16 @@ fn misuse_is_one_line_with_exit_code_2() {
 }
 
 #[test]
+fn a_row_of_a_table_fails_for_another_code_for_words_that_are_not_said_and_for_what_succeeds() {
+    for row in
+        ["3 | evaluate x | evaluate", "2 | evaluate x | absent", "0 | tone list | ", "2 | evaluate"]
+    {
+        let tried = std::panic::catch_unwind(|| fixture().refuses_all(row));
+        assert!(tried.is_err(), "{row}");
+    }
+}
+
+#[test]
 fn options_of_other_trainers_get_a_hint() {
     fixture().refuses_all(
         "

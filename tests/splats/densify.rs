@@ -333,10 +333,7 @@ fn a_gaussian_with_a_large_gradient_of_any_size_is_split_along_its_longest_axis(
 #[test]
 fn a_round_uses_its_share_of_the_remaining_gaussians_and_the_last_round_uses_the_rest() {
     let gpu = gpu();
-    let mut before = Host::calm(100);
-    for (i, sum) in before.grad_norm_sums.iter_mut().enumerate() {
-        *sum = 0.1 + i as f32;
-    }
+    let before = Host::ranked(100);
     for (rounds_left, count) in [(1, 130), (2, 115), (4, 108), (30, 101), (1000, 101)] {
         let settings = DensifySettings { max_gaussians: 130, ..CONSERVING };
         let (_, report) = before.densify(&gpu, settings, Round { rounds_left, ..LAST });
@@ -347,10 +344,7 @@ fn a_round_uses_its_share_of_the_remaining_gaussians_and_the_last_round_uses_the
 
 #[test]
 fn growth_stops_at_the_limit_that_the_views_set() {
-    let mut before = Host::calm(100);
-    for (i, sum) in before.grad_norm_sums.iter_mut().enumerate() {
-        *sum = 0.1 + i as f32;
-    }
+    let before = Host::ranked(100);
     for (most, count) in [(usize::MAX, 200), (130, 130), (100, 100), (0, 100)] {
         let (_, report) = before.densify(&gpu(), CONSERVING, Round { most, ..LAST });
         assert_eq!((report.count, report.refused), (count, 200 - count), "at most {most}");
@@ -392,10 +386,7 @@ fn large_enough_buffers_are_kept_and_others_grow_with_headroom() {
 #[test]
 fn a_refused_round_is_retried_with_fewer_splits_and_finally_with_none() {
     let gpu = gpu();
-    let mut before = Host::calm(100);
-    for (i, sum) in before.grad_norm_sums.iter_mut().enumerate() {
-        *sum = 0.1 + i as f32;
-    }
+    let mut before = Host::ranked(100);
     before.parameters[10 * 100] = -9.0;
     let round = |keeps: &mut dyn FnMut(usize) -> f64| {
         before.densify_as_kept(&[], &gpu, CONSERVING, LAST, keeps)

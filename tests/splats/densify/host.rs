@@ -81,6 +81,12 @@ impl Host {
         }
     }
 
+    /// Calm ones whose gradients grow with their numbers.
+    pub(super) fn ranked(count: usize) -> Self {
+        let grad_norm_sums = (0..count).map(|i| 0.1 + i as f32).collect();
+        Self { grad_norm_sums, ..Self::calm(count) }
+    }
+
     /// Large and small, faint and opaque Gaussians with gradients of all sizes; some were never visible.
     pub(super) fn mixed(count: usize) -> Self {
         let mut host = Self::calm(count);
