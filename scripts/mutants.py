@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Builds every mutant that cargo-mutants lists for some modules into one program, and names those that no test catches.
 
-    scripts/mutants.py [--minutes N] [--jobs N] [--seed N] [--tests LIST] [MODULE ...]
+    scripts/mutants.py [--minutes N] [--jobs N] [--seed N] [--tests LIST] [--every] [MODULE ...]
 
 A mutated function selects one of its bodies by the environment variable NIGHTSPLAT_MUTANT, so that a mutant costs the
 tests that reach it but no build. This happens in a copy of the tree, target/mutants, where results are kept in JSON;
@@ -13,6 +13,9 @@ is a fair sample.
   unreached    none of the tests calls the function
   unviable     it does not compile
   unplanted    not a whole body: in a const function, of an unnamed type, or a field left at its default
+
+A mutant's tests end with the first that fails; --every runs all that reach it, and prints and writes the table of
+kills, target/kills/mutants.json: every test that fails for each mutant, and the tests that are not needed.
 
 Needs `cargo install cargo-mutants --locked`. Exit code 1 if a mutant was missed.
 """
@@ -31,6 +34,8 @@ import threading
 import time
 from collections import Counter, defaultdict
 from pathlib import Path
+
+import kills
 
 ROOT = Path(__file__).resolve().parent.parent
 WORK = ROOT / "target" / "mutants"
@@ -199,16 +204,17 @@ def built(tests):
 
 
 def run_tests(program, names, seconds, **variables):
-    """Whether the tests pass in time, and their seconds."""
+    """The names of the tests that fail, all if they take too long or the process ends early; and their seconds."""
     begin = time.monotonic()
     try:
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+        quiet = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True, "start_new_session": True}
         run = subprocess.run([program, "--exact", "--test-threads", "1", *names], cwd=TREE, timeout=seconds,
                              env=dict(os.environ, **variables), **quiet)
-        passes = run.returncode == 0
+        failed = re.findall(r"^test (\S+)(?: - should panic)? \.\.\. FAILED", run.stdout, re.M)
+        failed = failed or (names if run.returncode != 0 else [])
     except subprocess.TimeoutExpired:
-        passes = False
-    return passes, time.monotonic() - begin
+        failed = names
+    return failed, time.monotonic() - begin
 
 
 def reach(programs, jobs, kept):
@@ -220,10 +226,10 @@ def reach(programs, jobs, kept):
         if key not in known:
             file = WORK / f"reached-{abs(hash(key))}"
             file.unlink(missing_ok=True)
-            passes, seconds = run_tests(programs[program], [name], 300, NIGHTSPLAT_REACHED=str(file))
+            failed, seconds = run_tests(programs[program], [name], 300, NIGHTSPLAT_REACHED=str(file))
             sites = sorted({int(line) for line in file.read_text().split()}) if file.exists() else []
             file.unlink(missing_ok=True)
-            known[key] = {"program": program, "name": name, "passes": passes, "seconds": seconds, "sites": sites}
+            known[key] = {"program": program, "name": name, "passes": not failed, "seconds": seconds, "sites": sites}
 
     with concurrent.futures.ThreadPoolExecutor(jobs) as pool:
         for program, path in programs.items():
@@ -235,14 +241,15 @@ def reach(programs, jobs, kept):
     return list(known.values())
 
 
-def verdict(mutant, tests, programs):
-    """The verdict on a mutant, and the test that gave it."""
+def verdict(mutant, tests, programs, every):
+    """The verdict on a mutant, what there is to say of it, and the tests that fail for it: of every one that reaches it
+    or of the first group in which one does."""
     own = [test for test in tests if mutant["site"] in test["sites"] and test["passes"]]
     own.sort(key=lambda test: test["seconds"])
     if not own:
-        return "unreached", None
-    spent = 0.0
-    while own and spent < MOST_SECONDS:
+        return "unreached", None, []
+    spent, killers = 0.0, []
+    while own and (every or spent < MOST_SECONDS and not killers):
         program, group, seconds = own[0]["program"], [], 0.0
         for test in own:
             if test["program"] == program and (not group or seconds + test["seconds"] < START_SECONDS + spent):
@@ -250,11 +257,12 @@ def verdict(mutant, tests, programs):
                 seconds += test["seconds"]
         own = [test for test in own if test not in group]
         names = [test["name"] for test in group]
-        passes, took = run_tests(programs[program], names, 4 * seconds + 20, NIGHTSPLAT_MUTANT=str(mutant["number"]))
-        if not passes:
-            return "caught", f"{program}: {names[0]}" + (f" or {len(names) - 1} more" if len(names) > 1 else "")
+        failed, took = run_tests(programs[program], names, 4 * seconds + 20, NIGHTSPLAT_MUTANT=str(mutant["number"]))
+        killers += [f"{program}: {name}" for name in failed]
         spent += took
-    return "missed", f"{len(own)} slow tests were not run" if own else None
+    if killers:
+        return "caught", None, killers
+    return "missed", f"{len(own)} slow tests were not run" if own else None, []
 
 
 def main():
@@ -265,6 +273,7 @@ def main():
     parser.add_argument("--jobs", type=int, default=2, help="tests that run in parallel")
     parser.add_argument("--seed", type=int, default=1, help="of the order of the mutants")
     parser.add_argument("--tests", default=TESTS, help="test programs in addition to the library's own tests")
+    parser.add_argument("--every", action="store_true", help="run all tests of a mutant, and write the table of kills")
     options = parser.parse_args()
     end = time.monotonic() + 60 * options.minutes
     known = kept_in()
@@ -280,14 +289,14 @@ def main():
     failing = [test["name"] for test in tests if not test["passes"]]
     print(f"ignored, since they fail without a mutant: {', '.join(failing) or 'none'}")
 
-    kept, lock = known / "verdicts.json", threading.Lock()
+    kept, lock = known / ("kills.json" if options.every else "verdicts.json"), threading.Lock()
     verdicts = json.loads(kept.read_text()) if kept.exists() else {}
     random.Random(options.seed).shuffle(mutants)
 
     def judge(mutant):
         name = mutant["name"]
         if name not in verdicts and time.monotonic() < end:
-            own = verdict(mutant, tests, programs)
+            own = verdict(mutant, tests, programs, options.every)
             with lock:
                 verdicts[name] = own
                 kept.write_text(json.dumps(verdicts, indent=1))
@@ -304,6 +313,10 @@ def main():
         what = verdicts.get(mutant["name"], ("not run",))[0] if mutant["number"] in numbers else \
             "unplanted" if mutant in unplanted else "unviable"
         counts[module][what] += 1
+    if options.every:
+        found = {name: own[2] for name, own in verdicts.items()}
+        ran = [f"{test['program']}: {test['name']}" for test in tests if test["passes"]]
+        kills.write(ROOT / "target/kills/mutants.json", found, ran)
     columns = ["caught", "missed", "unreached", "unviable", "unplanted", "not run"]
     print(f"{'':12}" + "".join(f"{column:>11}" for column in columns))
     for module, count in counts.items():

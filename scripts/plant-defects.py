@@ -1,10 +1,13 @@
 #!/usr/bin/env python3
 """Plants defects in the kernels and their wiring, one at a time, and shows which test catches each.
 
-    scripts/plant-defects.py [PART OF A NAME]
+    scripts/plant-defects.py [--every] [PART OF A NAME]
 
 Each defect is one replacement in one file, which is always restored. Its tests are built and run; one of them has to
 fail. Exit code 1 if a defect survives, or if the text to replace is no longer there.
+
+--every runs all tests of the program instead of those that the defect names, and writes the table of kills,
+target/kills/planted.json: every test that fails for each defect, and the tests that are not needed.
 """
 
 import re
@@ -12,6 +15,8 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+
+import kills
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -174,35 +179,39 @@ DEFECTS = [
 
 
 def plant(file, before, after, arguments):
-    """The result in words, and whether the defect was caught."""
+    """The result in words, and the tests that failed; none if the defect was not caught."""
     path = ROOT / file
     original = path.read_text()
     if original.count(before) != 1:
-        return f"the text to replace occurs {original.count(before)} times", False
+        return f"the text to replace occurs {original.count(before)} times", []
     try:
         path.write_text(original.replace(before, after))
         run = subprocess.run(["cargo", "test", "-q", *arguments.split()], cwd=ROOT, text=True, capture_output=True)
     finally:
         path.write_text(original)
     if "test result" not in run.stdout:
-        return "does not build: " + "; ".join(re.findall(r"^error.*", run.stderr, re.M)[:2]), False
+        return "does not build: " + "; ".join(re.findall(r"^error.*", run.stderr, re.M)[:2]), []
     failed = sorted(set(re.findall(r"^test (\S+) \.\.\. FAILED|^---- (\S+) stdout", run.stdout, re.M)))
     names = [name for pair in failed for name in pair if name]
     if run.returncode != 0 and not names:
         names = ["validation, as the process ended"]
-    return ", ".join(names) or "SURVIVED", bool(names)
+    return ", ".join(names) or "SURVIVED", names
 
 
 def main():
     # As an exception, an interruption restores the file.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))
-    wanted = " ".join(sys.argv[1:])
-    survivors = 0
+    every = "--every" in sys.argv
+    wanted = " ".join(word for word in sys.argv[1:] if word != "--every")
+    found = {}
     for name, file, before, after, arguments in DEFECTS:
         if wanted in name:
-            said, caught = plant(file, before, after, arguments)
-            survivors += not caught
-            print(f"{'caught' if caught else 'MISSED'}  {name} ({file}): {said}", flush=True)
+            words = arguments.split()
+            said, found[name] = plant(file, before, after, " ".join(words[:2]) if every else arguments)
+            print(f"{'caught' if found[name] else 'MISSED'}  {name} ({file}): {said}", flush=True)
+    if every:
+        kills.write(ROOT / "target/kills/planted.json", found)
+    survivors = sum(not failed for failed in found.values())
     sys.exit(survivors > 0)
 
 

@@ -1,62 +1,32 @@
 //! Scenes in blocks: plan, run, join, and what is refused.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
-
-use serde_json::Value;
-
-use crate::common::command::{command, refused, run, succeed};
-
-/// A street, and its plan of two blocks, trained and joined, done once.
-struct City(tempfile::TempDir);
+use crate::common::command::{Folder, json};
+use crate::common::prelude::*;
 
 const PLAN: &str = "--blocks 2 --steps 120 --seed 3 --sh-degree 1 --max-gaussians 3000 --plan none";
 
-fn city() -> &'static City {
-    static CITY: OnceLock<City> = OnceLock::new();
+/// A street, and in `city` its plan of two blocks, trained and joined, done once.
+fn shared() -> &'static Folder {
+    static CITY: OnceLock<Folder> = OnceLock::new();
     CITY.get_or_init(|| {
-        let city = City(tempfile::tempdir().unwrap());
-        succeed(&format!(
-            "synth {} --street 16 --width 48 --height 36",
-            city.path("street").display()
-        ));
-        succeed(&city.plan("city", PLAN));
-        succeed(&format!("blocks run {}", city.path("city").display()));
-        city
+        let folder = Folder::empty();
+        folder.succeed("synth @street --street 16 --width 48 --height 36");
+        folder.succeed(&plan("city", PLAN));
+        folder.succeed("blocks run @city");
+        folder
     })
 }
 
-impl City {
-    fn path(&self, name: &str) -> PathBuf {
-        self.0.path().join(name)
-    }
-
-    fn plan(&self, out: &str, options: &str) -> String {
-        let [street, out] = ["street", out].map(|name| self.path(name).display().to_string());
-        format!("blocks plan {street} --out {out} {options}")
-    }
-
-    /// A copy of the plan with its runs, beside it.
-    fn copied(&self) -> tempfile::TempDir {
-        let folder = tempfile::tempdir_in(self.0.path()).unwrap();
-        copy(&self.path("city"), folder.path());
-        folder
-    }
+fn plan(out: &str, options: &str) -> String {
+    format!("blocks plan @street --out @{out} {options}")
 }
 
-fn copy(from: &Path, to: &Path) {
-    fs::create_dir_all(to).unwrap();
-    for entry in fs::read_dir(from).unwrap().map(Result::unwrap) {
-        let to = to.join(entry.file_name());
-        if entry.path().is_dir() {
-            copy(&entry.path(), &to);
-        } else {
-            fs::copy(entry.path(), to).unwrap();
-        }
-    }
+/// A copy of the plan with its runs, beside it.
+fn copied() -> Folder {
+    Folder::copy_of(&shared().join("city"))
 }
 
+/// The bytes of every file below a folder.
 fn files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut found = vec![];
     let mut folders = vec![folder.to_owned()];
@@ -74,131 +44,111 @@ fn files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     found
 }
 
-fn manifest(city: &Path) -> Value {
-    serde_json::from_slice(&fs::read(city.join("model/manifest.json")).unwrap()).unwrap()
-}
-
 #[test]
 fn a_plan_has_the_same_bytes_on_any_number_of_threads_and_may_be_made_again() {
-    let city = city();
+    let shared = shared();
     for (out, threads) in [("one", "1"), ("two", "2")] {
-        let output =
-            command(&city.plan(out, PLAN)).env("RAYON_NUM_THREADS", threads).output().unwrap();
+        let mut command = shared.command(&plan(out, PLAN));
+        let output = command.env("RAYON_NUM_THREADS", threads).output().unwrap();
         assert!(output.status.success(), "{output:?}");
     }
-    succeed(&city.plan("two", PLAN));
-    let [one, two] = ["one", "two"].map(|out| files(&city.path(out)));
+    shared.succeed(&plan("two", PLAN));
+    let [one, two] = ["one", "two"].map(|out| files(&shared.path(out)));
     assert_eq!(one.len(), 5 * 3 + 5, "{:?}", one.iter().map(|(name, _)| name).collect::<Vec<_>>());
     assert!(one == two, "another plan");
 }
 
 #[test]
 fn a_dry_run_writes_nothing() {
-    let city = city();
-    let text = succeed(&city.plan("dry", &format!("{PLAN} --dry-run")));
+    let dry = plan("dry", &format!("{PLAN} --dry-run"));
+    let text = shared().succeed(&dry);
     assert!(text.contains("2 blocks, each with") && text.contains("120 steps of"), "{text}");
-    let json = succeed(&city.plan("dry", &format!("{PLAN} --dry-run --json")));
-    let json: Value = serde_json::from_str(&json).unwrap();
+    let json = json(shared().succeed(&format!("{dry} --json")));
     assert_eq!(json["block"].as_array().unwrap().len(), 4);
     let steps = |row: &Value| row["steps"].as_u64().unwrap();
     let blocks: u64 = json["block"].as_array().unwrap().iter().map(steps).sum();
     assert_eq!((steps(&json["coarse"]), blocks), (15, 105));
-    assert!(!city.path("dry").exists());
+    assert!(!shared().path("dry").exists());
 }
 
 #[test]
 fn the_joined_tiles_are_those_of_the_cores_and_are_opened_like_a_run() {
-    let city = city();
-    let folder = city.path("city");
-    let manifest = manifest(&folder);
+    let shared = shared();
+    let manifest = shared.json("city/model/manifest.json");
     let tiles = manifest["tiles"].as_array().unwrap();
     let counts: u64 = tiles.iter().map(|tile| tile["count"].as_u64().unwrap()).sum();
     assert_eq!((tiles.len(), Some(counts)), (2, manifest["count"].as_u64()));
     // Along the street, the first block ends where the second begins.
     let [first, second] = [&tiles[0], &tiles[1]].map(|tile| &tile["bounds"]);
     assert!(first["to"][0].as_f64() <= second["from"][0].as_f64());
-    let scores: Value =
-        serde_json::from_str(&succeed(&format!("eval {} --json", folder.display()))).unwrap();
+    let scores = json(shared.succeed("eval @city --json"));
     assert_eq!(scores["gaussians"].as_u64(), Some(counts));
     assert!(scores["mean"]["psnr"].as_f64().unwrap() > 12.0, "{}", scores["mean"]);
-    let exported = city.path("city.ply");
-    succeed(&format!("export {} --out {}", folder.display(), exported.display()));
-    let exported = String::from_utf8_lossy(&fs::read(exported).unwrap()).into_owned();
+    shared.succeed("export @city --out @city.ply");
+    let exported = String::from_utf8_lossy(&shared.read("city.ply")).into_owned();
     assert!(exported.contains(&format!("element vertex {counts}\n")));
     // Tile by tile, in two levels of the same cells.
-    let streamed = city.path("streamed");
     let options = "--format streamed-sog --levels 2 --chunk 1000";
-    succeed(&format!("export {} {options} --out {}", folder.display(), streamed.display()));
-    let index: Value =
-        serde_json::from_slice(&fs::read(streamed.join("lod-meta.json")).unwrap()).unwrap();
+    shared.succeed(&format!("export @city {options} --out @streamed"));
+    let index = shared.json("streamed/lod-meta.json");
     assert_eq!(index["lodLevels"].as_u64(), Some(2), "{index}");
 }
 
 #[test]
 fn a_level_of_the_joined_model_is_those_of_its_tiles() {
-    let city = city();
-    let level = |from: &Path, name: &str| {
-        let to = city.path(name);
+    let level = |from: &str, name: &str| {
         let options = "--format ply --level 1 --chunk 1000";
-        succeed(&format!("export {} {options} --out {}", from.display(), to.display()));
-        let bytes = fs::read(to).unwrap();
+        shared().succeed(&format!("export @{from} {options} --out @{name}"));
+        let bytes = shared().read(name);
         let end = b"end_header\n";
         let header = bytes.windows(end.len()).position(|bytes| bytes == end).unwrap();
         bytes[header + end.len()..].to_vec()
     };
-    let folder = city.path("city");
-    let tiles = ["0000", "0001"].map(|tile| folder.join(format!("model/0/{tile}.ply")));
-    let tiles = tiles.map(|tile| level(&tile, "level-of-tile.ply")).concat();
-    assert!(level(&folder, "level.ply") == tiles, "cells across tiles");
+    let tiles = ["city/model/0/0000.ply", "city/model/0/0001.ply"];
+    let tiles = tiles.map(|tile| level(tile, "level-of-tile.ply")).concat();
+    assert!(level("city", "level.ply") == tiles, "cells across tiles");
 }
 
 #[test]
 fn a_view_has_the_same_gain_in_every_block_and_in_a_run_on_all_views() {
-    let city = city();
-    let gains = |run: &Path| {
-        let metrics: Value =
-            serde_json::from_slice(&fs::read(run.join("metrics.json")).unwrap()).unwrap();
-        metrics["target_exposure"].clone()
-    };
-    let whole = city.path("whole");
-    let street = city.path("street");
-    succeed(&format!("train {} --out {} --steps 1 --plan none", street.display(), whole.display()));
-    let whole = gains(&whole);
-    let mut shared = 0;
+    let shared = shared();
+    let gains = |run: &str| shared.json(&format!("{run}/metrics.json"))["target_exposure"].clone();
+    shared.succeed("train @street --out @whole --steps 1 --plan none");
+    let whole = gains("whole");
+    let mut count = 0;
     for block in ["coarse", "blocks/0000", "blocks/0001-2"] {
-        let of_block = gains(&city.path("city").join(block).join("run"));
+        let of_block = gains(&format!("city/{block}/run"));
         assert_eq!(of_block["model_gain"], whole["model_gain"], "{block}");
         for (view, gain) in of_block["gains"].as_object().unwrap() {
             assert_eq!(*gain, whole["gains"][view], "{block} {view}");
-            shared += 1;
+            count += 1;
         }
     }
-    assert!(shared > 80, "{shared}");
+    assert!(count > 80, "{count}");
 }
 
 #[test]
 fn what_is_done_is_not_done_again_and_what_was_killed_gives_the_same_model() {
-    let city = city();
-    let copy = city.copied();
-    let before = manifest(copy.path());
+    let copy = copied();
+    let before = copy.json("model/manifest.json");
     // As if the second training had been killed before its first checkpoint, and the join had not begun.
     for gone in ["blocks/0001-2/run", "model"] {
-        fs::remove_dir_all(copy.path().join(gone)).unwrap();
+        fs::remove_dir_all(copy.path(gone)).unwrap();
     }
-    let text = succeed(&format!("blocks run {}", copy.path().display()));
+    let text = copy.succeed("blocks run @");
     assert!(text.contains("[2/7] 0000 is done") && !text.contains("0001-2 is done"), "{text}");
-    assert_eq!(manifest(copy.path()), before);
-    let again = succeed(&format!("blocks run {}", copy.path().display()));
+    assert_eq!(copy.json("model/manifest.json"), before);
+    let again = copy.succeed("blocks run @");
     assert!(again.contains("[7/7] join is done"), "{again}");
 }
 
 /// Joins a damaged copy of the plan, which must fail with one line and leave the joined model as it is.
-fn refuses_to_join(parts: &[&str], damage: impl FnOnce(&Path)) {
-    let copy = city().copied();
-    let before = files(&copy.path().join("model"));
-    damage(copy.path());
-    refused(&format!("blocks join {}", copy.path().display()), 3, parts);
-    assert!(files(&copy.path().join("model")) == before);
+fn refuses_to_join(parts: &[&str], damage: impl FnOnce(&Folder)) {
+    let copy = copied();
+    let before = files(&copy.path("model"));
+    damage(&copy);
+    copy.refused("blocks join @", 3, parts);
+    assert!(files(&copy.path("model")) == before);
 }
 
 #[test]
@@ -210,16 +160,11 @@ fn blocks_that_are_missing_unfinished_or_of_another_plan_are_refused_by_name() {
         fs::remove_file(city.join("blocks/0000-2/run/done.json")).unwrap();
     });
     refuses_to_join(&["blocks/0000-2", "of another plan"], |city| {
-        let path = city.join("blocks/0000-2/block.toml");
-        let text = fs::read_to_string(&path).unwrap();
-        let other = text.replacen("plan = \"", "plan = \"0", 1);
-        fs::write(path, other).unwrap();
+        let file = "blocks/0000-2/block.toml";
+        city.write(file, city.text(file).replacen("plan = \"", "plan = \"0", 1));
     });
-    let copy = city().copied();
-    refused(&format!("blocks join {} --round 3", copy.path().display()), 3, &["no round 3"]);
-    refuses_to_join(&["plan.toml", "is not a plan"], |city| {
-        fs::write(city.join("plan.toml"), "x = [").unwrap();
-    });
+    copied().refused("blocks join @ --round 3", 3, &["no round 3"]);
+    refuses_to_join(&["plan.toml", "is not a plan"], |city| city.write("plan.toml", "x = ["));
 }
 
 /// A file cannot be written under this path, as on a full disk. Returns its temporary name, which is taken.
@@ -233,11 +178,9 @@ fn block(path: &Path) -> PathBuf {
 #[cfg(target_os = "linux")]
 #[test]
 fn a_full_disk_stops_a_join_with_one_line_and_leaves_no_manifest_until_there_is_room() {
-    let city = city();
-    let joined = city.copied();
-    let (folder, model) = (joined.path(), joined.path().join("model"));
-    let join = format!("blocks join {}", folder.display());
-    let before = files(folder);
+    let folder = copied();
+    let model = folder.path("model");
+    let before = files(&folder);
     // Anew, and in place of an earlier model: from its first to its last file.
     for is_anew in [true, false] {
         for file in ["model/0/0000.ply", "model/0/0001.ply", "model/manifest.json"] {
@@ -247,13 +190,14 @@ fn a_full_disk_stops_a_join_with_one_line_and_leaves_no_manifest_until_there_is_
             }
             let partial = block(&folder.join(file));
             let blocked = folder.join(file).display().to_string();
-            refused(&join, 1, &[&blocked, "cannot be written", "check the folder and the disk"]);
+            let parts = [&blocked, "cannot be written", "check the folder and the disk"];
+            folder.refused("blocks join @", 1, &parts);
             fs::remove_dir(partial).unwrap();
             assert!(!model.join("manifest.json").exists(), "{file}: half a model with a manifest");
             // No command takes it for a model.
-            refused(&format!("eval {}", folder.display()), 3, &[&folder.display().to_string()]);
-            succeed(&join);
-            assert!(files(folder) == before, "{file}: another model once there is room");
+            folder.refused("eval @", 3, &[&folder.display().to_string()]);
+            folder.succeed("blocks join @");
+            assert!(files(&folder) == before, "{file}: another model once there is room");
         }
     }
 }
@@ -261,17 +205,16 @@ fn a_full_disk_stops_a_join_with_one_line_and_leaves_no_manifest_until_there_is_
 #[cfg(target_os = "linux")]
 #[test]
 fn a_full_disk_stops_an_export_of_tiles_with_one_line_and_leaves_no_index_until_there_is_room() {
-    let city = city();
-    let out = city.path("streamed-full");
-    let options = "--format streamed-sog --levels 2 --chunk 1000";
-    let export =
-        format!("export {} {options} --out {}", city.path("city").display(), out.display());
-    succeed(&export);
+    let shared = shared();
+    let out = shared.path("streamed-full");
+    let options = "--format streamed-sog --levels 2 --chunk 1000 --out @streamed-full";
+    let export = format!("export @city {options}");
+    shared.succeed(&export);
     let before = files(&out);
     // Limits the size of files, as on a full disk.
-    let program = command("").get_program().to_str().unwrap().to_owned();
-    let line = format!("trap '' XFSZ; ulimit -f 4; exec {program} {export}");
-    let output = std::process::Command::new("sh").args(["-c", &line]).output().unwrap();
+    let program = shared.command("").get_program().to_str().unwrap().to_owned();
+    let line = format!("trap '' XFSZ; ulimit -f 4; exec {program} {}", shared.named(&export));
+    let output = Command::new("sh").args(["-c", &line]).output().unwrap();
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{stderr}");
     let is_told = stderr.contains(&out.display().to_string()) && stderr.contains("the disk");
@@ -279,97 +222,72 @@ fn a_full_disk_stops_an_export_of_tiles_with_one_line_and_leaves_no_index_until_
     assert!(!out.join("lod-meta.json").exists(), "half a model with an index");
     // As a killed export leaves it.
     fs::write(out.join("lod-meta.json.partial"), "{").unwrap();
-    succeed(&export);
+    shared.succeed(&export);
     assert!(files(&out) == before, "another model once there is room");
 }
 
 #[test]
 fn photographs_that_changed_since_the_plan_are_named() {
-    let city = city();
-    let copy = city.copied();
-    let config = copy.path().join("config.toml");
-    let street = tempfile::tempdir_in(city.path("")).unwrap();
-    copy_set(&city.path("street"), street.path());
-    let text = fs::read_to_string(&config).unwrap();
-    let name = street.path().file_name().unwrap().to_string_lossy().into_owned();
-    fs::write(&config, text.replace("../street", &format!("../{name}"))).unwrap();
-    refused(
-        &format!("blocks join {}", copy.path().display()),
-        3,
-        &[&name, "has changed since the plan"],
-    );
-}
-
-fn copy_set(from: &Path, to: &Path) {
-    copy(from, to);
-    let photograph = fs::read_dir(to.join("low")).unwrap().next().unwrap().unwrap().path();
+    let (copy, street) = (copied(), Folder::copy_of(&shared().join("street")));
+    let photograph = fs::read_dir(street.join("low")).unwrap().next().unwrap().unwrap().path();
     let bytes = fs::read(&photograph).unwrap();
     fs::write(&photograph, [bytes, vec![0]].concat()).unwrap();
+    let name = street.file_name().unwrap().to_string_lossy();
+    copy.write("config.toml", copy.text("config.toml").replace("../street", &format!("../{name}")));
+    copy.refused("blocks join @", 3, &[&name, "has changed since the plan"]);
 }
 
 #[test]
 fn two_joins_at_once_and_blocks_of_two_devices_are_refused() {
-    let copy = city().copied();
-    let lock = fs::File::create(copy.path().join(".lock")).unwrap();
+    let copy = copied();
+    let lock = fs::File::create(copy.path(".lock")).unwrap();
     lock.lock().unwrap();
-    refused(&format!("blocks join {}", copy.path().display()), 1, &["another process"]);
+    copy.refused("blocks join @", 1, &["another process"]);
     drop(lock);
-    let metrics = copy.path().join("blocks/0001-2/run/metrics.json");
-    let text = fs::read_to_string(&metrics).unwrap();
+    let metrics = "blocks/0001-2/run/metrics.json";
+    let text = copy.text(metrics);
     assert!(text.contains("\"driver\": \""), "{text}");
-    fs::write(&metrics, text.replace("\"driver\": \"", "\"driver\": \"another, ")).unwrap();
-    let join = format!("blocks join {}", copy.path().display());
-    refused(&format!("{join} --same-device"), 3, &["several devices"]);
-    let (_, warning) = run(&join, 0);
+    copy.write(metrics, text.replace("\"driver\": \"", "\"driver\": \"another, "));
+    copy.refused("blocks join @ --same-device", 3, &["several devices"]);
+    let (_, warning) = copy.run("blocks join @", 0);
     assert!(warning.contains("several devices"), "{warning}");
-    assert_eq!(manifest(copy.path())["devices"].as_array().unwrap().len(), 2);
+    assert_eq!(copy.json("model/manifest.json")["devices"].as_array().unwrap().len(), 2);
 }
 
 #[test]
 fn plans_that_do_not_pay_or_cannot_be_made_are_refused_with_the_figure() {
-    let city = city();
-    let plan = |options: &str| city.plan("none", options);
-    let law = city.path("city/law.toml").display().to_string();
-    refused(&plan(&format!("--blocks 2 --law {law}")), 2, &["tone.law"]);
-    refused(&plan("--memory 1M --plan none"), 2, &["1 MiB", "--memory"]);
-    refused(&plan("--memory 64G --plan none"), 3, &["fits as a whole", "nightsplat train"]);
-    refused(&plan("--blocks 200 --plan none"), 3, &["fewer than 3", "fewer blocks"]);
+    let shared = shared();
     // Every view of a small set shows most of it.
-    let [set, out] = ["set", "set-city"].map(|name| city.path(name).display().to_string());
-    succeed(&format!("synth {set} --views 9 --width 48 --height 36"));
-    refused(
-        &format!("blocks plan {set} --out {out} --blocks 2 --plan none"),
-        3,
-        &["seen as a whole", "%", "nightsplat train"],
+    shared.succeed("synth @set --views 9 --width 48 --height 36");
+    shared.refuses_all(
+        "
+        2 | blocks plan @street --out @none --blocks 2 --law @city/law.toml | tone.law
+        2 | blocks plan @street --out @none --memory 1M --plan none | 1 MiB & --memory
+        3 | blocks plan @street --out @none --memory 64G --plan none | fits as a whole & nightsplat train
+        3 | blocks plan @street --out @none --blocks 200 --plan none | fewer than 3 & fewer blocks
+        3 | blocks plan @set --out @none --blocks 2 --plan none | seen as a whole & % & nightsplat train",
     );
-    assert!(!city.path("set-city").exists() && !city.path("none").exists());
+    assert!(!shared.path("none").exists());
     let other = PLAN.replace("--seed 3", "--seed 4");
-    refused(&city.plan("city", &other), 2, &["contains a plan with other settings"]);
+    shared.refused(&plan("city", &other), 2, &["contains a plan with other settings"]);
 }
 
 #[test]
 fn a_law_is_read_in_place_of_measuring_and_one_of_another_set_is_refused() {
-    let city = city();
-    let [street, run, law, frame] = ["street", "by-law", "city/law.toml", "city/frame.toml"]
-        .map(|name| city.path(name).display().to_string());
-    let shared = format!("--law {law} --frame {frame} --steps 1 --plan none");
-    succeed(&format!("train {street} --out {run} {shared}"));
-    let config = fs::read_to_string(city.path("by-law/config.toml")).unwrap();
+    let shared = shared();
+    let given = "--law @city/law.toml --frame @city/frame.toml --steps 1 --plan none";
+    shared.succeed(&format!("train @street --out @by-law {given}"));
+    let config = shared.text("by-law/config.toml");
     assert!(config.contains("law.toml") && config.contains("extent = "), "{config}");
-    let text = fs::read_to_string(&law).unwrap();
-    let short = city.path("short.toml");
-    fs::write(
-        &short,
-        text.lines().filter(|line| !line.starts_with("005 ")).collect::<Vec<_>>().join("\n"),
-    )
-    .unwrap();
-    let train = format!("train {street} --out {run}2 --steps 1 --plan none");
-    refused(&format!("{train} --law {}", short.display()), 2, &["lacks the view 005"]);
-    refused(&format!("{train} --law {frame}"), 3, &["is not a tone law"]);
-    refused(&format!("{train} --frame {law}"), 3, &["law.toml"]);
-    refused(
-        &format!("{train} --law {law} --set tone.brightness=0.5"),
-        3,
-        &["measured for the curve"],
+    let law = shared.text("city/law.toml");
+    let short: Vec<&str> = law.lines().filter(|line| !line.starts_with("005 ")).collect();
+    shared.write("short.toml", short.join("\n"));
+    shared.refuses_all(
+        "
+        2 | train @street --out @no --steps 1 --plan none --law @short.toml | lacks the view 005
+        3 | train @street --out @no --steps 1 --plan none --law @city/frame.toml | is not a tone law
+        3 | train @street --out @no --steps 1 --plan none --frame @city/law.toml | law.toml
+        3 | train @street --out @no --steps 1 --plan none --law @city/law.toml --set tone.brightness=0.5 \
+          | measured for the curve",
     );
 }

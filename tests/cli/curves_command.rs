@@ -5,6 +5,8 @@ use nightsplat::cli::tone::list::{ListArgs, text};
 use nightsplat_photographs::tone::FAMILIES;
 use nightsplat_synth::SyntheticOptions;
 
+use crate::common::command::{Folder, says};
+
 #[derive(Debug, Parser)]
 struct Command {
     #[command(flatten)]
@@ -46,38 +48,25 @@ fn values_agree_with_the_formula() {
 
 #[test]
 fn curves_are_drawn_with_the_statistics_of_a_dataset() {
-    let folder = tempfile::tempdir().unwrap();
-    let set = folder.path().join("set");
-    nightsplat_synth::write(
-        &set,
-        &SyntheticOptions { width: 32, height: 24, ..Default::default() },
-    )
-    .unwrap();
-    let csv = folder.path().join("mine.csv");
-    std::fs::write(&csv, "0,0\n1,0.7\n2,1\n").unwrap();
-    let svg = folder.path().join("curves.svg");
-    printed(&format!(
-        "ap3 ase linear lum_preserve per_channel p80 {} --plot {} --dataset {}",
-        csv.display(),
-        svg.display(),
-        set.display()
-    ));
-    let svg = std::fs::read_to_string(svg).unwrap();
+    let folder = Folder::empty();
+    let options = SyntheticOptions { width: 32, height: 24, ..Default::default() };
+    nightsplat_synth::write(folder.path("set"), &options).unwrap();
+    folder.write("mine.csv", "0,0\n1,0.7\n2,1\n");
+    let curves = "ap3 ase linear lum_preserve per_channel p80 @mine.csv";
+    printed(&folder.named(&format!("{curves} --plot @curves.svg --dataset @set")));
+    let svg = folder.text("curves.svg");
     assert!(svg.starts_with("<svg xmlns=") && svg.matches("<polyline").count() == 7, "{svg}");
-    for part in [">p10<", ">p90<", ">mean Y<", ">mine<", "--series-0"] {
-        assert!(svg.contains(part), "{part} is not in {svg}");
-    }
+    says(&svg, &[">p10<", ">p90<", ">mean Y<", ">mine<", "--series-0"]);
     assert!(!svg.contains("NaN"));
 }
 
 #[test]
 fn a_plot_without_names_shows_every_curve_that_is_listed() {
-    let folder = tempfile::tempdir().unwrap();
-    let svg = folder.path().join("curves.svg");
-    let message = printed(&format!("--plot {}", svg.display()));
+    let folder = Folder::empty();
+    let message = printed(&folder.named("--plot @curves.svg"));
     let all = FAMILIES.len() + 1;
     assert!(message.contains(&format!("{all} curves")), "{message}");
-    assert_eq!(std::fs::read_to_string(svg).unwrap().matches("<polyline").count(), all);
+    assert_eq!(folder.text("curves.svg").matches("<polyline").count(), all);
 }
 
 #[test]
@@ -90,18 +79,10 @@ fn an_unknown_curve_is_misuse() {
 #[test]
 fn a_formula_is_listed_tabulated_and_plotted_by_its_text() {
     let text = "a*t/(t+b);a=1.2;b=0.3";
-    let listing = printed(text);
-    assert!(
-        listing.contains("a*t/(t+b); a = 1.2; b = 0.3\n    a formula of your own"),
-        "{listing}"
-    );
-    let values = printed(&format!("{text} t^0.45 --table --at 0.3,1"));
-    assert!(values.contains("0.600") && values.contains("0.923"), "{values}");
-    let folder = tempfile::tempdir().unwrap();
-    let svg = folder.path().join("curves.svg");
-    printed(&format!("{text} t^0.45 ap3 --plot {}", svg.display()));
-    let svg = std::fs::read_to_string(svg).unwrap();
-    assert!(svg.contains("a*t/(t+b); a = 1.2; b = 0.3") && svg.contains("t^0.45"), "{svg}");
-    let message = parse("gama").unwrap_err().to_string();
-    assert!(message.contains("the nearest is `gamma`"), "{message}");
+    says(&printed(text), &["a*t/(t+b); a = 1.2; b = 0.3\n    a formula of your own"]);
+    says(&printed(&format!("{text} t^0.45 --table --at 0.3,1")), &["0.600", "0.923"]);
+    let folder = Folder::empty();
+    printed(&folder.named(&format!("{text} t^0.45 ap3 --plot @curves.svg")));
+    says(&folder.text("curves.svg"), &["a*t/(t+b); a = 1.2; b = 0.3", "t^0.45"]);
+    says(&parse("gama").unwrap_err().to_string(), &["the nearest is `gamma`"]);
 }

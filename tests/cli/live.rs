@@ -1,15 +1,11 @@
 //! The live page of `view` and `train --view`, asked as a browser asks and as an attacker does.
 
-use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
-use std::path::Path;
-use std::process::{Child, Stdio};
-use std::time::{Duration, Instant};
+use std::process::Child;
 
-use serde_json::Value;
-
-use crate::common::command::{command, refused, succeed};
+use crate::common::command::{Folder, json};
+use crate::common::prelude::*;
 use crate::fixture;
 
 /// A command that serves a page, until it is dropped.
@@ -27,9 +23,9 @@ impl Drop for Serving {
 }
 
 impl Serving {
-    fn start(arguments: &str) -> Self {
-        let mut process =
-            command(arguments).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
+    fn start(folder: &Folder, arguments: &str) -> Self {
+        let mut command = folder.command(arguments);
+        let mut process = command.stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
         let mut lines = BufReader::new(process.stderr.take().unwrap()).lines().map(Result::unwrap);
         let line = lines.find(|line| line.contains("http://")).expect("no address is printed");
         let url = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();
@@ -85,7 +81,7 @@ impl Serving {
     fn state(&self) -> Value {
         let (status, body) = self.ask("GET", "state");
         assert_eq!(status, 200);
-        serde_json::from_slice(&body).unwrap()
+        json(body)
     }
 
     /// The first state for which `holds`.
@@ -114,15 +110,16 @@ const LONG: &str = "--steps 20000 --seed 3 --sh-degree 1 --curve ap3 --model pla
 
 #[test]
 fn the_page_of_a_run_shows_model_photographs_and_targets() {
-    let serving = Serving::start(&format!("view {} --listen 0", fixture().run()));
+    let serving = Serving::start(fixture(), "view @run --listen 0");
     let (status, page) = serving.ask("GET", "");
     let page = String::from_utf8(page).unwrap();
     assert!(status == 200 && page.contains("picture/0/photograph"), "{page}");
     let state = serving.state();
-    assert_eq!(
-        (&state["phase"], &state["step"], &state["model"]),
-        (&"finished".into(), &40.into(), &1.into())
-    );
+    for (key, value) in
+        [("phase", Value::from("finished")), ("step", 40.into()), ("model", 1.into())]
+    {
+        assert_eq!(state[key], value);
+    }
     assert_eq!(state["canControl"], false);
     let (_, model) = serving.ask("GET", "model");
     assert_eq!(u64::from(u32::from_le_bytes(*model.first_chunk().unwrap())), state["gaussians"]);
@@ -146,17 +143,16 @@ fn the_page_of_a_run_shows_model_photographs_and_targets() {
 
 #[test]
 fn a_page_follows_a_model_file_and_a_dataset() {
-    let folder = tempfile::tempdir().unwrap();
-    let model = folder.path().join("model.ply");
-    fs::copy(fixture().path("run/model.ply"), &model).unwrap();
-    let serving = Serving::start(&format!("view {} --listen 0", model.display()));
+    let folder = Folder::empty();
+    folder.write("model.ply", fixture().model("run"));
+    let serving = Serving::start(&folder, "view @model.ply --listen 0");
     assert_eq!(serving.until("a model", |state| state["model"] == 1)["phase"], "model");
-    fs::remove_file(&model).unwrap();
+    fs::remove_file(folder.path("model.ply")).unwrap();
     let gone = serving.until("a problem", |state| !state["problem"].is_null());
     assert!(gone["problem"].as_str().unwrap().contains("is gone"), "{gone}");
     assert_eq!(serving.ask("GET", "model").0, 200);
 
-    let serving = Serving::start(&format!("view {} --listen 0", fixture().set()));
+    let serving = Serving::start(fixture(), "view @set --listen 0");
     let state = serving.until("points", |state| state["model"] == 1);
     assert_eq!(state["phase"], "model");
     assert_eq!(serving.ask("GET", "picture/1/target").0, 200);
@@ -164,11 +160,9 @@ fn a_page_follows_a_model_file_and_a_dataset() {
 
 #[test]
 fn a_training_is_paused_saved_and_stopped_from_its_page() {
-    let folder = tempfile::tempdir().unwrap();
-    let run = folder.path().join("run");
-    let set = fixture().set();
-    let mut serving =
-        Serving::start(&format!("train {set} --out {} {LONG} --view 127.0.0.1:0", run.display()));
+    let run = fixture().path("stopped-from-page");
+    let train = format!("train @set --out @stopped-from-page {LONG} --view 127.0.0.1:0");
+    let mut serving = Serving::start(fixture(), &train);
     let first = serving.until("a model", |state| state["model"].as_u64() > Some(0));
     assert_eq!((&first["phase"], &first["canControl"]), (&"training".into(), &true.into()));
     assert!(first["modelStep"].is_u64(), "{first}");
@@ -200,20 +194,16 @@ fn a_training_is_paused_saved_and_stopped_from_its_page() {
     assert_eq!(serving.ask("POST", "do/stop").0, 200);
     let stopped = serving.until("stopped", |state| !state["endedBy"].is_null());
     let told = stopped["endedBy"].as_str().unwrap();
-    assert!(
-        told.starts_with("stopped after step ") && told.contains("--resume --finish"),
-        "{told}"
-    );
+    assert!(told.starts_with("stopped after step "), "{told}");
+    assert!(told.contains("--resume --finish"), "{told}");
     assert_eq!(serving.process.wait().unwrap().code(), Some(130));
     assert!(run.join("checkpoint.safetensors").exists());
 }
 
 #[test]
 fn a_training_is_finished_from_its_page_also_while_it_is_paused() {
-    let folder = tempfile::tempdir().unwrap();
-    let (set, run) = (fixture().set(), folder.path().join("run"));
-    let mut serving =
-        Serving::start(&format!("train {set} --out {} {LONG} --view 0", run.display()));
+    let train = format!("train @set --out @finished-from-page {LONG} --view 0");
+    let mut serving = Serving::start(fixture(), &train);
     serving.until("a model", |state| state["model"].as_u64() > Some(0));
     assert_eq!(serving.ask("POST", "do/pause").0, 200);
     serving.until("paused", |state| state["phase"] == "paused");
@@ -221,12 +211,12 @@ fn a_training_is_finished_from_its_page_also_while_it_is_paused() {
     let cooling = serving.until("its last step", |state| state["steps"].as_u64() < Some(20_000));
     assert!(cooling["steps"].as_u64() > cooling["step"].as_u64(), "{cooling}");
     assert!(serving.process.wait().unwrap().success());
-    assert!(run.join("metrics.json").exists());
+    assert!(fixture().path("finished-from-page/metrics.json").exists());
 }
 
 #[test]
 fn a_page_on_all_addresses_is_opened_at_one_of_them() {
-    let serving = Serving::start(&format!("view {} --listen 0.0.0.0:0", fixture().run()));
+    let serving = Serving::start(fixture(), "view @run --listen 0.0.0.0:0");
     assert!(!serving.address.ip().is_unspecified(), "{}", serving.address);
     assert_eq!(serving.ask("GET", "state").0, 200);
 }
@@ -254,22 +244,10 @@ fn attack(serving: &Serving) -> Vec<TcpStream> {
 
 #[test]
 fn hostile_clients_change_no_bit_of_a_training_and_hold_little_memory() {
-    let folder = tempfile::tempdir().unwrap();
-    let set = fixture().set();
-    let train = |name: &str| {
-        let out = folder.path().join(name);
-        (
-            format!(
-                "train {set} --out {} --steps 600 --seed 3 --sh-degree 1 --curve ap3 --model plain",
-                out.display()
-            ),
-            out,
-        )
-    };
-    let (alone, unwatched) = train("alone");
-    succeed(&alone);
-    let (arguments, watched) = train("watched");
-    let mut serving = Serving::start(&format!("{arguments} --progress none --view 0"));
+    let train = "--steps 600 --seed 3 --sh-degree 1 --curve ap3 --model plain";
+    fixture().succeed(&format!("train @set --out @unwatched {train}"));
+    let watched = format!("train @set --out @watched {train} --progress none --view 0");
+    let mut serving = Serving::start(fixture(), &watched);
     serving.until("a model", |state| state["model"].as_u64() > Some(0));
     // It shall not end before the attack does.
     assert_eq!(serving.ask("POST", "do/pause").0, 200);
@@ -291,21 +269,24 @@ fn hostile_clients_change_no_bit_of_a_training_and_hold_little_memory() {
     }
     assert_eq!(serving.ask("POST", "do/resume").0, 200);
     assert!(serving.process.wait().unwrap().success());
-    let model = |run: &Path| fs::read(run.join("model.ply")).unwrap();
-    assert!(model(&unwatched) == model(&watched), "watching changed the model");
+    let [unwatched, watched] = ["unwatched", "watched"].map(|run| fixture().model(run));
+    assert!(unwatched == watched, "watching changed the model");
 }
 
 #[test]
 fn an_address_in_use_and_a_path_that_is_nothing_are_refused() {
-    let serving = Serving::start(&format!("view {} --listen 0", fixture().run()));
+    let serving = Serving::start(fixture(), "view @run --listen 0");
     let port = serving.address.port();
-    refused(
-        &format!("view {} --listen {port}", fixture().run()),
+    fixture().refused(
+        &format!("view @run --listen {port}"),
         2,
         &[&port.to_string(), "in use", "another port"],
     );
-    refused("view nowhere", 3, &["nowhere", "does not exist", "run directory"]);
-    refused(&format!("view {} --listen here", fixture().run()), 2, &["here", "127.0.0.1:7007"]);
-    let empty = tempfile::tempdir().unwrap();
-    refused(&format!("view {}", empty.path().display()), 3, &["transforms"]);
+    fs::create_dir(fixture().path("empty")).unwrap();
+    fixture().refuses_all(
+        "
+        3 | view nowhere | nowhere & does not exist & run directory
+        2 | view @run --listen here | here & 127.0.0.1:7007
+        3 | view @empty | transforms",
+    );
 }

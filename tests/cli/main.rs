@@ -1,15 +1,9 @@
 //! The built binary as a shell runs it: its files, its output, and its errors for bad input.
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
-use std::fs;
-use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
-
 use nightsplat::kernels;
 use nightsplat::networks::lpips::Network;
-use nightsplat_photographs::image::{Image, ImageFile};
-use nightsplat_photographs::metrics::{self, Scores};
-use serde_json::Value;
+use nightsplat_photographs::metrics;
 
 mod blocks;
 #[path = "../common/mod.rs"]
@@ -25,61 +19,33 @@ mod sweep;
 mod tone_command;
 mod tuning;
 mod unread;
-use common::command::{refused, succeed};
+use common::command::{Folder, file_names, json, says, succeed};
 use common::copy;
 
-/// Work shared by the tests, done once: a small dataset and a short run on it.
-struct Fixture {
-    folder: tempfile::TempDir,
-}
+use crate::common::prelude::*;
 
 const TRAIN: &str = "--steps 40 --seed 3 --sh-degree 1 --curve ap3 --model plain";
 
-fn fixture() -> &'static Fixture {
-    static FIXTURE: OnceLock<Fixture> = OnceLock::new();
+/// A small dataset in `set` and a short run on it in `run`, shared by the tests.
+fn fixture() -> &'static Folder {
+    static FIXTURE: OnceLock<Folder> = OnceLock::new();
     FIXTURE.get_or_init(|| {
-        let fixture = Fixture { folder: tempfile::tempdir().unwrap() };
-        succeed(&format!("synth {} --views 9 --width 64 --height 48", fixture.set()));
-        succeed(&format!("train {} --out {} {TRAIN}", fixture.set(), fixture.run()));
-        fixture
+        let folder = Folder::empty();
+        folder.succeed("synth @set --views 9 --width 64 --height 48");
+        folder.succeed(&format!("train @set --out @run {TRAIN}"));
+        folder
     })
 }
 
-impl Fixture {
-    fn set(&self) -> String {
-        self.path("set").display().to_string()
-    }
-
-    fn run(&self) -> String {
-        self.path("run").display().to_string()
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-}
-
-/// A copy of the fixture's dataset, to damage.
-fn copied_set() -> tempfile::TempDir {
-    let folder = tempfile::tempdir().unwrap();
-    copy(&fixture().path("set"), folder.path());
+/// A copy of the fixture's dataset in `set`, to damage.
+fn copied_set() -> Folder {
+    let folder = Folder::empty();
+    copy(&fixture().path("set"), &folder.path("set"));
     folder
-}
-
-fn json(path: impl AsRef<Path>) -> Value {
-    serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
 }
 
 fn keys(value: &Value) -> Vec<&str> {
     value.as_object().unwrap().keys().map(String::as_str).collect()
-}
-
-fn file_names(folder: impl AsRef<Path>) -> Vec<String> {
-    let entries = fs::read_dir(folder).unwrap();
-    let mut names: Vec<String> =
-        entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
-    names.sort();
-    names
 }
 
 #[test]
@@ -89,107 +55,86 @@ fn a_run_directory_has_its_files_and_metrics_have_their_keys() {
         assert!(run.join(name).is_file(), "{name}");
     }
     assert!(file_names(&run).iter().all(|name| !name.ends_with(".partial")));
-    let metrics = json(run.join("metrics.json"));
-    let residual_transmittance = "residual_transmittance";
+    let metrics = fixture().json("run/metrics.json");
+    let residual = &metrics["residual_transmittance"];
     let known =
         "mean views seconds gaussians steps residual_transmittance spent ended trained_with";
     assert_eq!(keys(&metrics).join(" "), known);
-    for made_by in [&metrics["trained_with"], &json(run.join("done.json"))["trained_with"]] {
+    for made_by in [&metrics["trained_with"], &fixture().json("run/done.json")["trained_with"]] {
         assert_eq!(made_by["nightsplat"], env!("CARGO_PKG_VERSION"));
         assert!(!made_by["device"].as_str().unwrap().is_empty(), "{made_by}");
     }
-    assert_eq!(keys(&metrics[residual_transmittance]), ["mean", "views"]);
-    assert_eq!(keys(&metrics[residual_transmittance]["views"]["008"]), ["mean", "q99"]);
-    assert_eq!(keys(&metrics["mean"]), ["psnr", "psnr_channel_mean", "ssim"]);
-    assert_eq!(keys(&metrics["views"]), ["000", "008"]);
-    assert_eq!(keys(&metrics["views"]["008"]), ["psnr", "psnr_channel_mean", "ssim"]);
+    let scores = ["psnr", "psnr_channel_mean", "ssim"];
+    for (value, known) in [
+        (residual, &["mean", "views"][..]),
+        (&residual["views"]["008"], &["mean", "q99"]),
+        (&metrics["mean"], &scores),
+        (&metrics["views"], &["000", "008"]),
+        (&metrics["views"]["008"], &scores),
+    ] {
+        assert_eq!(keys(value), known);
+    }
     assert_eq!(metrics["steps"], 40);
-    assert!(
-        metrics["gaussians"].as_u64().unwrap() > 1000 && metrics["seconds"].as_f64().unwrap() > 0.0
-    );
+    assert!(metrics["gaussians"].as_u64() > Some(1000) && metrics["seconds"].as_f64() > Some(0.0));
     let views = metrics["views"].as_object().unwrap();
     let mean = views.values().map(|view| view["psnr"].as_f64().unwrap()).sum::<f64>() / 2.0;
     assert!((metrics["mean"]["psnr"].as_f64().unwrap() - mean).abs() < 1e-9);
 
-    let log = fs::read_to_string(run.join("train.csv")).unwrap();
+    let log = fixture().text("run/train.csv");
     assert_eq!(log.lines().next(), Some("step,view,loss,l1,ssim,gaussians,milliseconds"));
     assert_eq!(log.lines().count(), 41);
     assert!(log.lines().nth(40).unwrap().starts_with("40,"));
-    let config = fs::read_to_string(run.join("config.toml")).unwrap();
+    let config = fixture().text("run/config.toml");
     assert!(config.starts_with("# trained with {\"nightsplat\":"), "{config}");
-    assert!(config.contains("seed = 3") && config.contains("curve = \"ap3\""), "{config}");
-    assert!(
-        fs::read(run.join("model.ply")).unwrap().starts_with(b"ply\nformat binary_little_endian")
-    );
+    says(&config, &["seed = 3", "curve = \"ap3\""]);
+    assert!(fixture().model("run").starts_with(b"ply\nformat binary_little_endian"));
 }
 
 #[test]
 fn a_seed_gives_one_model_for_any_references() {
-    let set = copied_set();
+    let folder = copied_set();
     // Every reference pixel changes, but the model's bits must not.
-    for name in file_names(set.path().join("high")) {
-        let path = set.path().join("high").join(name);
+    for name in file_names(folder.path("set/high")) {
+        let path = folder.path("set/high").join(name);
         let mut image = Image::load(&path).unwrap();
         image.data.iter_mut().for_each(|value| *value = 1.0 - *value);
         image.save_png8(&path).unwrap();
     }
-    let (root, run) = (set.path().display(), set.path().join("run"));
-    succeed(&format!("train {root} --out {} {TRAIN}", run.display()));
-    let first = fs::read(fixture().path("run/model.ply")).unwrap();
-    assert!(first == fs::read(run.join("model.ply")).unwrap(), "the references changed the model");
-    let means = [fixture().path("run"), run.clone()]
-        .map(|run| json(run.join("metrics.json"))["mean"].clone());
+    folder.succeed(&format!("train @set --out @run {TRAIN}"));
+    let first = fixture().model("run");
+    assert!(first == folder.model("run"), "the references changed the model");
+    let means = [fixture(), &folder].map(|folder| folder.json("run/metrics.json")["mean"].clone());
     assert_ne!(means[0], means[1], "the scores ought to change with the references");
     // A finished run is the configuration of the next, which replaces it.
     let config = fixture().path("run/config.toml");
-    succeed(&format!(
-        "train {root} --out {} --config {} --overwrite",
-        run.display(),
-        config.display()
-    ));
-    assert!(
-        first == fs::read(run.join("model.ply")).unwrap(),
-        "the configuration changed the model"
-    );
-    succeed(
-        &format!("train {root} --out {} {TRAIN} --overwrite --seed 4", run.display())
-            .replace("--seed 3", ""),
-    );
-    assert!(
-        first != fs::read(run.join("model.ply")).unwrap(),
-        "another seed ought to change the model"
-    );
+    folder.succeed(&format!("train @set --out @run --config {} --overwrite", config.display()));
+    assert!(first == folder.model("run"), "the configuration changed the model");
+    let other = TRAIN.replace("--seed 3", "--seed 4");
+    folder.succeed(&format!("train @set --out @run {other} --overwrite"));
+    assert!(first != folder.model("run"), "another seed ought to change the model");
 }
 
 #[test]
 fn eval_agrees_with_train_and_saves_the_scored_images() {
     let fixture = fixture();
     let run = fixture.path("run");
-    let printed: Value =
-        serde_json::from_str(&succeed(&format!("eval {} --json --save-images", fixture.run())))
-            .unwrap();
-    let trained = json(run.join("metrics.json"));
+    let printed = json(fixture.succeed("eval @run --json --save-images"));
+    let trained = fixture.json("run/metrics.json");
     assert_eq!(printed, trained);
     let names = ["000.png", "008.png"];
     assert_eq!(file_names(run.join("eval/renders")), names);
     assert_eq!(file_names(run.join("eval/references")), names);
     for name in ["000", "008"] {
-        let load =
-            |kind: &str| Image::load(run.join("eval").join(kind).join(name).with_extension("png"));
-        let scores =
-            Scores::measure(&load("renders").unwrap(), &load("references").unwrap()).unwrap();
+        let load = |kind| Image::load(run.join(format!("eval/{kind}/{name}.png"))).unwrap();
+        let scores = Scores::measure(&load("renders"), &load("references")).unwrap();
         let scored = &trained["views"][name];
         assert!((scores.psnr - scored["psnr"].as_f64().unwrap()).abs() < 0.01, "{name}");
         assert!((scores.ssim - scored["ssim"].as_f64().unwrap()).abs() < 0.001, "{name}");
     }
-    let page = fixture.path("eval.html");
-    let table = succeed(&format!("eval {} --report {}", fixture.run(), page.display()));
-    assert!(table.contains("wrote ") && table.contains("eval.html"), "{table}");
-    let page = fs::read_to_string(page).unwrap();
-    for part in ["The worst view, 0", "error, times 5", "reference image<", ">loss<", "mean</td>"] {
-        assert!(page.contains(part), "no `{part}` in the page");
-    }
-    let table = succeed(&format!("eval {}", fixture.run()));
+    says(&fixture.succeed("eval @run --report @eval.html"), &["wrote ", "eval.html"]);
+    let parts = ["The worst view, 0", "error, times 5", "reference image<", ">loss<", "mean</td>"];
+    says(&fixture.text("eval.html"), &parts);
+    let table = fixture.succeed("eval @run");
     let lines: Vec<&str> = table.lines().collect();
     assert!(lines.len() == 5 && lines[4].starts_with("next: nightsplat "), "{table}");
     assert!(lines[0].starts_with("view") && lines[0].contains("channel mean"), "{table}");
@@ -201,24 +146,23 @@ fn eval_agrees_with_train_and_saves_the_scored_images() {
 #[test]
 fn eval_adds_ssim_with_a_uniform_window_on_request() {
     let fixture = fixture();
-    let eval = format!("eval {} --uniform-ssim", fixture.run());
-    let scores: Value =
-        serde_json::from_str(&succeed(&format!("{eval} --json --save-images"))).unwrap();
+    let scores = json(fixture.succeed("eval @run --uniform-ssim --json --save-images"));
     for name in ["000", "008"] {
-        let path = |kind: &str| fixture.path("run").join("eval").join(kind).join(name);
-        let load = |kind: &str| Image::load(path(kind).with_extension("png")).unwrap();
+        let load =
+            |kind| Image::load(fixture.path(&format!("run/eval/{kind}/{name}.png"))).unwrap();
         let expected = metrics::ssim_uniform(&load("renders"), &load("references")).unwrap();
         let scored = scores["views"][name]["ssim_uniform"].as_f64().unwrap();
         assert!((scored - expected).abs() < 1e-4, "{name}: {scored}, not {expected}");
     }
-    assert!(succeed(&eval).lines().next().unwrap().contains("SSIM, uniform"));
+    let table = fixture.succeed("eval @run --uniform-ssim");
+    says(table.lines().next().unwrap(), &["SSIM, uniform"]);
 }
 
 #[test]
 fn eval_scores_lpips_with_given_weights() {
     let fixture = fixture();
     let weights = fixture.path("weights.safetensors");
-    let eval = format!("eval {} --lpips {}", fixture.run(), weights.display());
+    let eval = "eval @run --lpips @weights.safetensors";
     for (network, range, key, title) in [
         (Network::Alex, "signed", "lpips", "LPIPS "),
         (Network::Alex, "unit", "lpips_alex_unit", "LPIPS alex unit"),
@@ -226,11 +170,8 @@ fn eval_scores_lpips_with_given_weights() {
         (Network::Vgg, "unit", "lpips_vgg_unit", "LPIPS vgg unit"),
     ] {
         common::lpips::write(network, &weights, |_, _, _| {});
-        let eval = match range {
-            "signed" => eval.clone(),
-            _ => format!("{eval} --lpips-range {range}"),
-        };
-        let scores: Value = serde_json::from_str(&succeed(&format!("{eval} --json"))).unwrap();
+        let more = if range == "signed" { "" } else { "--lpips-range unit" };
+        let scores = json(fixture.succeed(&format!("{eval} {more} --json")));
         let of = |name: &str| scores["views"][name][key].as_f64().unwrap();
         let mean = scores["mean"][key].as_f64().unwrap();
         assert!((mean - (of("000") + of("008")) / 2.0).abs() < 1e-12 && mean > 0.0, "{scores}");
@@ -238,68 +179,55 @@ fn eval_scores_lpips_with_given_weights() {
         assert_eq!(scores["lpips"], message);
         let keys = keys(&scores["mean"]);
         assert_eq!(keys.iter().filter(|key| key.starts_with("lpips")).count(), 1, "{keys:?}");
-        let table = succeed(&eval);
+        let table = fixture.succeed(&format!("{eval} {more}"));
         let header = format!("{} ", table.lines().next().unwrap());
         assert!(header.contains(title) && table.contains(&format!("{mean:.4}")), "{table}");
     }
     fs::write(&weights, "no weights").unwrap();
-    refused(&eval, 3, &["weights.safetensors", "safetensors"]);
-    let without = format!("eval {} --lpips-range unit", fixture.run());
-    refused(&without, 2, &["--lpips <WEIGHTS>"]);
-    assert!(json(fixture.path("run/metrics.json")).get("lpips").is_none(), "train scores no LPIPS");
+    fixture.refused(eval, 3, &["weights.safetensors", "safetensors"]);
+    fixture.refused("eval @run --lpips-range unit", 2, &["--lpips <WEIGHTS>"]);
+    assert!(fixture.json("run/metrics.json").get("lpips").is_none(), "train scores no LPIPS");
 }
 
 #[test]
 fn a_set_without_references_and_photographs_of_test_views_scores_nothing() {
-    let set = copied_set();
-    fs::remove_dir_all(set.path().join("high")).unwrap();
+    let folder = copied_set();
+    fs::remove_dir_all(folder.path("set/high")).unwrap();
     for name in ["000", "008"] {
-        fs::remove_file(set.path().join("low").join(name).with_extension("png")).unwrap();
+        fs::remove_file(folder.path(&format!("set/low/{name}.png"))).unwrap();
     }
-    let (root, run) = (set.path().display(), set.path().join("run"));
-    succeed(&format!("train {root} --out {} --steps 2", run.display()));
-    assert_eq!(json(run.join("metrics.json"))["mean"], Value::Null);
-    let (printed, message) = common::command::run(&format!("eval {} --json", run.display()), 0);
-    let printed: Value = serde_json::from_str(&printed).unwrap();
+    folder.succeed("train @set --out @run --steps 2");
+    assert_eq!(folder.json("run/metrics.json")["mean"], Value::Null);
+    let (printed, message) = folder.run("eval @run --json", 0);
+    let printed = json(printed);
     assert_eq!((&printed["mean"], keys(&printed["views"]).len()), (&Value::Null, 0));
-    assert!(message.contains("no test view has a reference image or a photograph"), "{message}");
-    assert_eq!(succeed(&format!("eval {}", run.display())).lines().count(), 2);
+    says(&message, &["no test view has a reference image or a photograph"]);
+    assert_eq!(folder.succeed("eval @run").lines().count(), 2);
 }
 
 #[test]
 fn every_pose_of_a_split_is_rendered_with_or_without_an_image() {
-    let set = copied_set();
+    let folder = copied_set();
     // A test view that has only its pose.
-    for folder in ["low", "high"] {
-        fs::remove_file(set.path().join(folder).join("008.png")).unwrap();
+    for name in ["low", "high"] {
+        fs::remove_file(folder.path(&format!("set/{name}/008.png"))).unwrap();
     }
-    let run = set.path().join("run");
-    fs::create_dir(&run).unwrap();
-    fs::copy(fixture().path("run/model.ply"), run.join("model.ply")).unwrap();
-    let config = fs::read_to_string(fixture().path("run/config.toml")).unwrap();
-    fs::write(
-        run.join("config.toml"),
-        config.replace(&fixture().set(), &set.path().display().to_string()),
-    )
-    .unwrap();
+    fs::create_dir(folder.path("run")).unwrap();
+    folder.write("run/model.ply", fixture().model("run"));
+    let config = fixture().text("run/config.toml");
+    folder
+        .write("run/config.toml", config.replace(&fixture().named("@set"), &folder.named("@set")));
     let render = |split: &str, format: &str| {
-        let out = run.join(split);
-        succeed(&format!(
-            "render {} --split {split} --out {} --format {format}",
-            run.display(),
-            out.display()
-        ));
-        (file_names(&out), out)
+        folder.succeed(&format!("render @run --split {split} --out @{split} --format {format}"));
+        file_names(folder.path(split))
     };
-    let (names, exr) = render("all", "exr");
-    assert_eq!(names, (0..9).map(|view| format!("{view:03}.exr")).collect::<Vec<_>>());
-    let (names, png) = render("test", "png");
-    assert_eq!(names, ["000.png", "008.png"]);
-    let (names, _) = render("train", "png");
-    assert_eq!(names.len(), 7);
+    let all: Vec<_> = (0..9).map(|view| format!("{view:03}.exr")).collect();
+    assert_eq!(render("all", "exr"), all);
+    assert_eq!(render("test", "png"), ["000.png", "008.png"]);
+    assert_eq!(render("train", "png").len(), 7);
     for name in ["000", "008"] {
-        let [float, byte] = [exr.join(format!("{name}.exr")), png.join(format!("{name}.png"))]
-            .map(|path| Image::load(path).unwrap());
+        let [float, byte] = [format!("all/{name}.exr"), format!("test/{name}.png")]
+            .map(|path| Image::load(folder.path(&path)).unwrap());
         assert_eq!((byte.width, byte.height), (64, 48));
         for (float, byte) in float.data.iter().zip(&byte.data) {
             assert!((float.clamp(0.0, 1.0) - byte).abs() < 0.51 / 255.0, "{float} {byte}");
@@ -309,28 +237,25 @@ fn every_pose_of_a_split_is_rendered_with_or_without_an_image() {
 
 #[test]
 fn renders_never_replace_the_photographs() {
-    let (low, run) = (fixture().path("set/low"), fixture().run());
-    let before = fs::read(low.join("001.png")).unwrap();
-    let arguments = format!("render {run} --split all --out {}", low.display());
-    refused(&arguments, 1, &["low", "inside the dataset", "--out"]);
-    assert_eq!(before, fs::read(low.join("001.png")).unwrap());
+    let before = fixture().read("set/low/001.png");
+    let parts = ["low", "inside the dataset", "--out"];
+    fixture().refused("render @run --split all --out @set/low", 1, &parts);
+    assert_eq!(before, fixture().read("set/low/001.png"));
 }
 
 #[test]
 fn doctor_lists_the_devices_and_their_features() {
-    let report = succeed("doctor");
-    assert!(report.contains("yes  timelineSemaphore") && report.contains("Vulkan 1."), "{report}");
-    assert!(report.contains("ready: trains on ") && report.contains("colmap  "), "{report}");
+    let parts = ["yes  timelineSemaphore", "Vulkan 1.", "ready: trains on ", "colmap  "];
+    says(&succeed("doctor"), &parts);
 }
 
 #[test]
 fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
     let small = "bench --json --repeats 1 --width 64 --height 48 --gaussians 300";
-    let printed: Value = serde_json::from_str(&succeed(small)).unwrap();
-    assert!(
-        !printed["device"].as_str().unwrap().is_empty()
-            && !printed["driver"].as_str().unwrap().is_empty()
-    );
+    let printed = json(succeed(small));
+    for of in ["device", "driver"] {
+        assert!(!printed[of].as_str().unwrap().is_empty(), "{of}");
+    }
     assert!(printed["step_ms"].as_f64().unwrap() > 0.0);
     assert!(printed["groups"]["blend_forward"].as_f64().unwrap() > 0.0);
     let errors = printed["errors"].as_object().unwrap();
@@ -356,20 +281,16 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
 
 #[test]
 fn bench_times_a_trained_model_in_the_storage_of_training() {
-    let fixture = fixture();
-    let run = fixture.run();
-    let bench = |arguments: &str| -> Value {
+    let bench = |arguments: &str| {
         let options = "--json --unchecked --repeats 1 --steady 2";
-        serde_json::from_str(&succeed(&format!("bench {options} {arguments}"))).unwrap()
+        json(fixture().succeed(&format!("bench {options} {arguments}")))
     };
-    let of_run = bench(&format!("{run} --precision 16"));
+    let of_run = bench("@run --precision 16");
     let kernels = keys(&of_run["kernels"]);
     assert!(kernels.contains(&"adam_gaussian"), "{kernels:?}");
-    assert_eq!(
-        (&of_run["scene"], &of_run["precision"]["rest"]),
-        (&run.as_str().into(), &"16".into())
-    );
-    let of_file = bench(&format!("{run}/model.ply --width 32 --height 40"));
+    assert_eq!(of_run["scene"], fixture().named("@run"));
+    assert_eq!(of_run["precision"]["rest"], "16");
+    let of_file = bench("@run/model.ply --width 32 --height 40");
     assert_eq!((&of_file["width"], &of_file["height"]), (&32.into(), &40.into()));
     let counts = [&of_run["gaussians"], &of_file["gaussians"]].map(|count| count.as_u64().unwrap());
     assert!(counts[0] > 0 && counts[0] == counts[1], "{counts:?}");
@@ -380,38 +301,33 @@ fn bench_times_a_trained_model_in_the_storage_of_training() {
 
 #[test]
 fn demo_changes_no_foreign_folder() {
-    let folder = tempfile::tempdir().unwrap();
-    fs::write(folder.path().join("thesis.tex"), "mine").unwrap();
-    refused(&format!("demo --out {}", folder.path().display()), 1, &["not empty", "--out"]);
-    assert_eq!(file_names(folder.path()), ["thesis.tex"]);
+    let folder = Folder::empty();
+    folder.write("thesis.tex", "mine");
+    folder.refused("demo --out @", 1, &["not empty", "--out"]);
+    assert_eq!(file_names(&folder), ["thesis.tex"]);
 }
 
 #[test]
 fn demo_is_a_sweep_of_four_curves_that_continues_and_links_the_model() {
-    let folder = tempfile::tempdir().unwrap();
-    let demo = format!("demo --out {} --steps 20", folder.path().display());
-    let table = succeed(&demo);
+    let folder = Folder::empty();
+    let table = folder.succeed("demo --out @ --steps 20");
     for curve in ["auto", "linear", "ase", "ap3"] {
-        assert!(folder.path().join(format!("curve={curve}/model.ply")).is_file(), "{table}");
+        assert!(folder.path(&format!("curve={curve}/model.ply")).is_file(), "{table}");
     }
-    let page = fs::read_to_string(folder.path().join("index.html")).unwrap();
-    assert!(page.contains("exposed") && page.contains("data:image/png"));
-    assert!(page.contains("<a href=\"curve=auto/model.html\">"));
-    assert!(folder.path().join("curve=auto/model.html").is_file());
-    assert_eq!(succeed(&demo), table, "nothing is trained twice");
+    let link = "<a href=\"curve=auto/model.html\">";
+    says(&folder.text("index.html"), &["exposed", "data:image/png", link]);
+    assert!(folder.path("curve=auto/model.html").is_file());
+    assert_eq!(folder.succeed("demo --out @ --steps 20"), table, "nothing is trained twice");
 }
 
 /// A reader that ends early, as `head` does.
 #[test]
 fn a_closed_pipe_ends_a_command_quietly() {
-    let set = fixture().set();
-    for arguments in
-        [&format!("tone apply {set} --json"), &format!("diagnose {set}"), "doctor", "tone list"]
-    {
-        let mut command = common::command::command(arguments);
+    for arguments in ["tone apply @set --json", "diagnose @set", "doctor", "tone list"] {
+        let mut command = fixture().command(arguments);
         let (reader, writer) = std::io::pipe().unwrap();
         drop(reader);
-        let output = command.stdout(writer).stderr(std::process::Stdio::piped()).output().unwrap();
+        let output = command.stdout(writer).stderr(Stdio::piped()).output().unwrap();
         let message = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success() && !message.contains("error"), "{arguments}: {message}");
     }
@@ -419,9 +335,9 @@ fn a_closed_pipe_ends_a_command_quietly() {
 
 #[test]
 fn man_pages_keep_the_lines_of_their_examples() {
-    let folder = tempfile::tempdir().unwrap();
-    succeed(&format!("man {}", folder.path().display()));
-    let page = fs::read_to_string(folder.path().join("nightsplat-train.1")).unwrap();
+    let folder = Folder::empty();
+    folder.succeed("man @");
+    let page = folder.text("nightsplat-train.1");
     let (_, examples) = page.split_once(".SH EXAMPLES\n.nf\n").unwrap();
     assert!(examples.lines().any(|line| line.contains("nightsplat train photos")), "{examples}");
     assert!(examples.ends_with(".fi\n") && page.contains("ssim"), "{page}");
@@ -447,24 +363,17 @@ fn help_fits_a_screen_and_help_all_has_every_option_in_lines_that_fit() {
         .filter(|line| line.starts_with("  ") && !line.starts_with("   "))
         .filter_map(|line| line.split_whitespace().next())
         .collect();
-    assert!(
-        names.len() <= 15 && names.contains(&"train") && !names.contains(&"synth"),
-        "{names:?}"
-    );
+    assert!(names.len() <= 15, "{names:?}");
+    assert!(names.contains(&"train") && !names.contains(&"synth"), "{names:?}");
     let (short, all) = (succeed("train -h"), succeed("train --help-all"));
     assert_eq!(short, succeed("train --help"));
-    for part in ["--preset", "--max-vram", "Example:", "--help-all"] {
-        assert!(short.contains(part), "no `{part}` in {short}");
-    }
+    says(&short, &["--preset", "--max-vram", "Example:", "--help-all"]);
     assert!(!short.contains("--ssim-weight"), "{short}");
     for group in ["Photographs:", "Tone curve:", "Model:", "Logs and checks:"] {
         assert!(all.contains(&format!("\n{group}\n")), "no `{group}` in {all}");
     }
-    for option in "--curve --gain --theta --steps --downscale --seed --sh-degree --ssim-weight --max-gaussians \
-                   --background --reference --device --config --eval-every --out --overwrite --max-resolution --cache \
-                   --test-every --tensorboard"
-        .split_whitespace()
-    {
-        assert!(all.contains(option), "{option}");
-    }
+    let options = "--curve --gain --theta --steps --downscale --seed --sh-degree --ssim-weight --max-gaussians \
+         --background --reference --device --config --eval-every --out --overwrite --max-resolution --cache \
+         --test-every --tensorboard";
+    says(&all, &options.split_whitespace().collect::<Vec<_>>());
 }

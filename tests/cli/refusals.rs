@@ -1,183 +1,163 @@
 //! Errors of the binary for bad input.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-
-use nightsplat_photographs::image::{Image, ImageFile};
-use serde_json::Value;
-use tempfile::TempDir;
-
-use crate::common::command::{command, refused, refused_with, run};
+use crate::common::command::{Folder, refused_with, says};
+use crate::common::fixture as committed;
+use crate::common::prelude::*;
 use crate::{copied_set, fixture};
 
-/// Training on `root` must fail with one line and leave no run that looks complete.
-fn refuses_to_train(root: &Path, options: &str, code: i32, parts: &[&str]) {
-    let run = root.join("run");
-    refused(&format!("train {} --out {} {options}", root.display(), run.display()), code, parts);
-    for name in ["metrics.json", "model.ply"] {
-        assert!(!run.join(name).exists(), "{name} remains");
+/// Trainings, `TRAIN`, and other commands that must be refused with one line, and leave no run that looks complete.
+fn refuses_all(folder: &Folder, table: &str) {
+    folder.refuses_all(&table.replace("TRAIN", "train @set --out @refused"));
+    for name in ["refused/metrics.json", "refused/model.ply"] {
+        assert!(!folder.join(name).exists(), "{name} remains");
     }
 }
 
-/// A step of training on `root` must succeed and print all of `parts` on standard error.
-fn trains_and_says(root: &Path, options: &str, parts: &[&str]) {
-    let out = root.join("run");
-    let train = format!("train {} --out {} --steps 1 {options}", root.display(), out.display());
-    let (_, stderr) = run(&train, 0);
-    assert!(out.join("metrics.json").exists(), "{stderr}");
-    for part in parts {
-        assert!(stderr.contains(part), "no `{part}` in: {stderr}");
-    }
+/// A step of training on the set must succeed and print all of `parts` on standard error.
+fn trains_and_says(folder: &Folder, options: &str, parts: &[&str]) {
+    let (_, stderr) = folder.run(&format!("train @set --out @run --steps 1 {options}"), 0);
+    assert!(folder.join("run/metrics.json").exists(), "{stderr}");
+    says(&stderr, parts);
 }
 
-fn edit(path: PathBuf, change: impl FnOnce(String) -> String) {
-    let text = fs::read_to_string(&path).unwrap();
-    fs::write(path, change(text)).unwrap();
-}
-
-fn edit_listing(set: &TempDir, change: impl FnOnce(&mut Value)) {
-    edit(set.path().join("transforms_train.json"), |text| {
-        let mut listing = serde_json::from_str(&text).unwrap();
-        change(&mut listing);
-        listing.to_string()
-    });
+fn edit_listing(folder: &Folder, change: impl FnOnce(&mut Value)) {
+    let mut listing = folder.json("set/transforms_train.json");
+    change(&mut listing);
+    folder.write("set/transforms_train.json", listing.to_string());
 }
 
 #[test]
 fn a_missing_dataset_and_one_without_photographs_are_named() {
-    let folder = tempfile::tempdir().unwrap();
-    let nowhere = folder.path().join("nowhere");
-    let run = folder.path().join("run");
-    refused(
-        &format!("train {} --out {}", nowhere.display(), run.display()),
-        3,
-        &["nowhere", "not a folder"],
-    );
-    assert!(!run.exists());
-    refuses_to_train(folder.path(), "", 3, &["holds no dataset", "transforms"]);
-    let set = copied_set();
-    fs::remove_dir_all(set.path().join("low")).unwrap();
-    refuses_to_train(set.path(), "", 3, &["no photograph is left to train on"]);
+    let folder = copied_set();
+    fs::remove_dir_all(folder.join("set/low")).unwrap();
+    fs::create_dir(folder.join("empty")).unwrap();
+    let table = "
+        3 | train @nowhere --out @refused | nowhere & not a folder
+        3 | train @empty --out @refused   | holds no dataset & transforms";
+    refuses_all(&folder, table);
+    assert!(!folder.join("refused").exists());
+    refuses_all(&folder, "3 | TRAIN | no photograph is left to train on");
 }
 
 #[test]
 fn absent_and_broken_photographs_are_left_out_by_name() {
-    let set = copied_set();
-    fs::remove_file(set.path().join("low/003.png")).unwrap();
-    fs::write(set.path().join("low/004.png"), "no image").unwrap();
-    trains_and_says(set.path(), "", &["low/003.png", "absent", "low/004.png", "not a readable"]);
+    let folder = copied_set();
+    fs::remove_file(folder.join("set/low/003.png")).unwrap();
+    folder.write("set/low/004.png", "no image");
+    trains_and_says(&folder, "", &["low/003.png", "absent", "low/004.png", "not a readable"]);
 }
 
 #[test]
 fn points_that_no_device_represents_and_views_that_show_nothing_are_reported() {
-    let set = copied_set();
-    edit(set.path().join("colmap_sparse/0/points3D.txt"), |text| {
-        text + "900001 1e39 0 0 1 2 3 0.5\n900002 0 -1e300 0 1 2 3 0.5\n900003 1e9 0 0 1 2 3 0.5\n"
-    });
-    trains_and_says(set.path(), "--plan none", &["3 of ", "points", "left out"]);
+    let folder = copied_set();
+    let points = "set/colmap_sparse/0/points3D.txt";
+    let more = "900001 1e39 0 0 1 2 3 0.5\n900002 0 -1e300 0 1 2 3 0.5\n900003 1e9 0 0 1 2 3 0.5\n";
+    folder.write(points, folder.text(points) + more);
+    trains_and_says(&folder, "--plan none", &["3 of ", "points", "left out"]);
 
-    let set = copied_set();
-    edit_listing(&set, |listing| {
+    let folder = copied_set();
+    edit_listing(&folder, |listing| {
         // The second view looks the opposite way: the x and z axes are negated.
         let matrix = listing["frames"][1]["transform_matrix"].as_array_mut().unwrap();
         for (row, column) in (0..3).flat_map(|row| [(row, 0), (row, 2)]) {
             matrix[row][column] = Value::from(-matrix[row][column].as_f64().unwrap());
         }
     });
-    trains_and_says(set.path(), "--plan none", &["view 002 contains none"]);
+    trains_and_says(&folder, "--plan none", &["view 002 contains none"]);
 
-    let set = copied_set();
-    edit_listing(&set, |listing| {
+    let folder = copied_set();
+    edit_listing(&folder, |listing| {
         listing["frames"][2]["transform_matrix"][0][3] = Value::from(1e300);
     });
-    trains_and_says(set.path(), "--plan none", &["view 003 stands", "check its pose"]);
+    trains_and_says(&folder, "--plan none", &["view 003 stands", "check its pose"]);
 }
 
 #[test]
 fn images_far_larger_than_their_views_are_refused_before_they_are_decoded_or_left_out() {
-    let bomb = |set: &TempDir, path: &str| {
-        let path = set.path().join(path);
+    let bomb = |path: &str| {
+        let folder = copied_set();
+        let path = folder.join(path);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
         Image::from_fn(1200, 900, |x, y| [(x + y) as f32 / 2100.0; 3]).save_png8(path).unwrap();
+        folder
     };
-    let set = copied_set();
-    bomb(&set, "high/000.png");
-    refuses_to_train(set.path(), "", 3, &["high/000.png", "1200x900", "64 times"]);
-    let set = copied_set();
-    bomb(&set, "depth/001.png");
+    let table = "3 | TRAIN | high/000.png & 1200x900 & 64 times";
+    refuses_all(&bomb("set/high/000.png"), table);
     let parts = ["depth of view 001 is not used", "64 times"];
-    trains_and_says(set.path(), "--plan none --parts depth", &parts);
+    trains_and_says(&bomb("set/depth/001.png"), "--plan none --parts depth", &parts);
 }
 
 #[test]
 fn a_run_directory_is_not_replaced_without_a_request_nor_created_in_a_file() {
-    let fixture = fixture();
-    let before = fs::read(fixture.path("run/metrics.json")).unwrap();
-    refused(
-        &format!("train {} --out {}", fixture.set(), fixture.run()),
-        1,
-        &["already contains a run", "--overwrite"],
-    );
-    assert_eq!(before, fs::read(fixture.path("run/metrics.json")).unwrap());
-    let file = fixture.path("set/low/000.png");
-    refused(
-        &format!("train {} --out {}/run", fixture.set(), file.display()),
-        1,
-        &["cannot be written"],
-    );
+    let before = fixture().read("run/metrics.json");
+    let table = "
+        1 | train @set --out @run                | already contains a run & --overwrite
+        1 | train @set --out @set/low/000.png/run | cannot be written";
+    fixture().refuses_all(table);
+    assert_eq!(before, fixture().read("run/metrics.json"));
 }
 
 #[test]
 fn misuse_is_one_line_with_exit_code_2() {
-    let set = fixture().set();
-    let train =
-        |options: &str, parts: &[&str]| refuses_to_train(Path::new(&set), options, 2, parts);
-    train("--curve sepia", &["sepia", "linear, ase, ap3", "--help"]);
-    train("--steps 0", &["--steps"]);
-    train("--sh-degree 4", &["--sh-degree", "0 to 3"]);
-    train("--downscale 0.5", &["downscale"]);
-    train("--background blue", &["background (--background) is \"blue\"", "black or random"]);
-    train("--stepz 3", &["--stepz"]);
-    train("--steps many", &["steps (--steps) is \"many\"; it must be a whole number, at least 1"]);
-    train("--set stop.not_finite=skip", &["stop.not_finite is", "stop or skip-view"]);
-    train("--set schedule.initial_rates.quats=nan", &["schedule.initial_rates.quats is nan"]);
-    train("--max-vram 4", &["--max-vram", "4G or 1.5G"]);
-    train("--set max_ram=100", &["max_ram", "with its unit"]);
-    train("--set density.gradient=1", &["`density.gradient`", "`density.gradient_threshold`"]);
-    train(
-        "--exposure on --parts tonemapper",
-        &["exposure.learn (--exposure) is true", "tonemapper"],
-    );
-    refused("train", 2, &["--out", "required"]);
-    refused("evaluate x", 2, &["evaluate"]);
-    refused("render x --split none --out y", 2, &["none", "train, test, all"]);
-    refused("bench --repeats 0", 2, &["--repeats"]);
-    refused("bench --precision 8", 2, &["precision.rest", "32 or 16"]);
-    refused("bench model.ply --gaussians 7", 2, &["--gaussians"]);
-    refused("bench no.ply", 3, &["no.ply"]);
-    refused("train photos --out run --steps -3", 2, &["--steps", "-3"]);
+    let table = "
+        2 | TRAIN --curve sepia | sepia & linear, ase, ap3 & --help
+        2 | TRAIN --steps 0 | --steps
+        2 | TRAIN --sh-degree 4 | --sh-degree & 0 to 3
+        2 | TRAIN --downscale 0.5 | downscale
+        2 | TRAIN --background blue | background (--background) is \"blue\" & black or random
+        2 | TRAIN --stepz 3 | --stepz
+        2 | TRAIN --steps many | steps (--steps) is \"many\"; it must be a whole number, at least 1
+        2 | TRAIN --set stop.not_finite=skip | stop.not_finite is & stop or skip-view
+        2 | TRAIN --set schedule.initial_rates.quats=nan | schedule.initial_rates.quats is nan
+        2 | TRAIN --max-vram 4 | --max-vram & 4G or 1.5G
+        2 | TRAIN --set max_ram=100 | max_ram & with its unit
+        2 | TRAIN --set density.gradient=1 | `density.gradient` & `density.gradient_threshold`
+        2 | TRAIN --exposure on --parts tonemapper | exposure.learn (--exposure) is true & tonemapper
+        2 | TRAIN --steps 5 --iterations 7 | --steps & multiple times
+        2 | train | --out & required
+        2 | evaluate x | evaluate
+        2 | render x --split none --out y | none & train, test, all
+        2 | export @run | --format
+        2 | export @run --out model | pass --format: ply, spz, glb
+        2 | export @run --out model.xyz | model.xyz has the ending of no format
+        2 | export @run --format spz --out a.ply | a.ply is a file of --format ply
+        2 | bench --repeats 0 | --repeats
+        2 | bench --precision 8 | precision.rest & 32 or 16
+        2 | bench model.ply --gaussians 7 | --gaussians
+        3 | bench no.ply | no.ply
+        2 | train photos --out run --steps -3 | --steps & -3
+        2 | train photos --out run --progress loud | bar & plain & json & none";
+    refuses_all(fixture(), table);
 }
 
 #[test]
-fn options_of_other_trainers_get_a_hint() {
-    for (options, ours) in [
-        ("-s photos --out run", "use DATASET"),
-        ("--source_path photos --out run", "use DATASET"),
-        ("--data photos --out run", "use DATASET"),
-        ("photos -m run", "use --out DIR"),
-        ("photos --model_path run", "use --out DIR"),
-        ("photos --out run --resolution 4", "use --downscale F"),
-        ("photos --out run --max-num-iterations 7000", "use --steps N"),
-        ("photos --out run --format ply", "nightsplat export RUN --format"),
-        ("photos --out run --cap-max 1000", "use --max-gaussians N"),
-    ] {
-        refused(&format!("train {options}"), 2, &["there is no `-", ours]);
+fn a_row_of_a_table_fails_for_another_code_for_words_that_are_not_said_and_for_what_succeeds() {
+    for row in
+        ["3 | evaluate x | evaluate", "2 | evaluate x | absent", "0 | tone list | ", "2 | evaluate"]
+    {
+        let tried = std::panic::catch_unwind(|| fixture().refuses_all(row));
+        assert!(tried.is_err(), "{row}");
     }
 }
 
 #[test]
+fn options_of_other_trainers_get_a_hint() {
+    fixture().refuses_all(
+        "
+        2 | train -s photos --out run | there is no `- & use DATASET
+        2 | train --source_path photos --out run | there is no `- & use DATASET
+        2 | train --data photos --out run | there is no `- & use DATASET
+        2 | train photos -m run | there is no `- & use --out DIR
+        2 | train photos --model_path run | there is no `- & use --out DIR
+        2 | train photos --out run --resolution 4 | there is no `- & use --downscale F
+        2 | train photos --out run --max-num-iterations 7000 | there is no `- & use --steps N
+        2 | train photos --out run --format ply | there is no `- & nightsplat export RUN --format
+        2 | train photos --out run --cap-max 1000 | there is no `- & use --max-gaussians N",
+    );
+}
+
+#[test]
 fn an_output_that_cannot_be_written_is_refused_before_anything_is_read() {
-    let file = fixture().path("set/low/000.png").display().to_string();
     for command in [
         "train /nonexistent/set --out OUT/run",
         "sweep /nonexistent/set --curves all --out OUT/sweep",
@@ -188,45 +168,35 @@ fn an_output_that_cannot_be_written_is_refused_before_anything_is_read() {
         "eval /nonexistent/run --report OUT/a.html",
         "tone apply /nonexistent/set --out OUT/toned",
     ] {
-        refused(&command.replace("OUT", &file), 1, &["000.png/", "cannot be written"]);
+        let command = command.replace("OUT", "@set/low/000.png");
+        fixture().refused(&command, 1, &["000.png/", "cannot be written"]);
     }
 }
 
-#[test]
-fn an_export_has_the_format_of_its_ending_or_says_that_there_is_none() {
-    let formats = "has the ending of no format; pass --format: ply, spz, glb";
-    refused("export run --out model.xyz", 2, &["model.xyz", formats]);
-    refused("export run --out model", 2, &[formats]);
-    refused("export run --format spz --out a.ply", 2, &["a.ply is a file of --format ply"]);
-    refused("export run", 2, &["--format"]);
-}
-
-/// `nightsplat` with arguments, in a shell after these words.
+/// The exit code and standard error of `nightsplat` with arguments, in a shell after these words.
 #[cfg(unix)]
-fn after(shell: &str, arguments: &str) -> std::process::Output {
-    let nightsplat = command(arguments);
-    let mut sh = std::process::Command::new("sh");
+fn after(shell: &str, folder: &Folder, arguments: &str) -> (Option<i32>, String) {
+    let nightsplat = folder.command(arguments);
+    let mut sh = Command::new("sh");
     sh.args(["-c", &format!("{shell}; exec \"$0\" \"$@\"")]).arg(nightsplat.get_program());
     sh.args(nightsplat.get_args());
     sh.envs(nightsplat.get_envs().filter_map(|(name, value)| Some((name, value?))));
-    sh.output().unwrap()
+    let output = sh.output().unwrap();
+    (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
 }
 
 #[cfg(unix)]
 #[test]
 fn a_limit_of_the_size_of_files_is_an_error_that_names_the_file_and_a_full_disk_ends_help() {
-    let folder = tempfile::tempdir().unwrap();
-    let out = folder.path().join("edited.ply");
-    let edit = format!("edit {}/model.ply --up 0,-1,0 --out {}", fixture().run(), out.display());
-    let output = after("ulimit -f 4", &edit);
-    let stderr = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{stderr}");
-    assert!(stderr.contains("edited.ply: cannot be written (File too large"), "{stderr}");
-    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "a partial file");
+    let folder = Folder::empty();
+    let edit = format!("edit {} --up 0,-1,0 --out @edited.ply", fixture().named("@run/model.ply"));
+    let (code, stderr) = after("ulimit -f 4", &folder, &edit);
+    assert_eq!(code, Some(1), "{stderr}");
+    says(&stderr, &["edited.ply: cannot be written (File too large"]);
+    assert_eq!(fs::read_dir(&folder).unwrap().count(), 0, "a partial file");
     if Path::new("/dev/full").exists() {
-        let output = after("exec > /dev/full", "train --help");
-        let stderr = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(1), "{stderr}");
+        let (code, stderr) = after("exec > /dev/full", &folder, "train --help");
+        assert_eq!(code, Some(1), "{stderr}");
         assert!(stderr.starts_with("error: help cannot be written"), "{stderr}");
     }
 }
@@ -235,18 +205,17 @@ fn a_limit_of_the_size_of_files_is_an_error_that_names_the_file_and_a_full_disk_
 #[test]
 fn an_address_space_without_room_for_a_driver_is_named_however_small_it_is() {
     for mebibytes in [150, 400] {
-        let output = after(&format!("ulimit -v {}", mebibytes << 10), "doctor");
-        let stderr = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(4), "{stderr}");
+        let limit = format!("ulimit -v {}", mebibytes << 10);
+        let (code, stderr) = after(&limit, fixture(), "doctor");
+        assert_eq!(code, Some(4), "{stderr}");
         assert!(stderr.contains("raise `ulimit -v`"), "{mebibytes}: {stderr}");
     }
 }
 
 #[test]
 fn a_model_that_is_refused_names_its_remedy() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = |name: &str| folder.path().join(name);
-    let whole = fs::read(fixture().path("run/model.ply")).unwrap();
+    let folder = Folder::empty();
+    let whole = fixture().model("run");
     let header = whole.windows(10).position(|bytes| bytes == b"end_header").unwrap() + 11;
     let text = String::from_utf8(whole[..header].to_vec()).unwrap();
     let changed = |from: &str, to: &str| {
@@ -263,87 +232,71 @@ fn a_model_that_is_refused_names_its_remedy() {
         ("a.sog", b"PK\x03\x04".to_vec(), ["is not a SOG", again]),
         ("empty.ply", vec![], ["neither PLY, SPZ nor SOG", "a run directory"]),
     ] {
-        fs::write(path(name), bytes).unwrap();
-        let [model, out] = [name, "out.spz"].map(|name| path(name).display().to_string());
-        refused(
-            &format!("export {model} --format spz --out {out}"),
-            3,
-            &[&[name][..], &parts].concat(),
-        );
+        folder.write(name, bytes);
+        let export = format!("export @{name} --format spz --out @out.spz");
+        folder.refused(&export, 3, &[&[name][..], &parts].concat());
     }
     // More than there is memory.
-    fs::write(path("long.ply"), "no model").unwrap();
-    fs::File::options().write(true).open(path("long.ply")).unwrap().set_len(1 << 43).unwrap();
-    let long = format!("edit {} --up 0,-1,0 --out x.ply", path("long.ply").display());
-    refused(&long, 3, &["long.ply", "neither PLY, SPZ nor SOG"]);
-    fs::write(path("scan.zip"), "PK").unwrap();
-    let [zip, out] = ["scan.zip", "run"].map(|name| path(name).display().to_string());
-    let train = format!("train {} --out {out} --steps 1 --plan none", fixture().set());
-    let (_, stderr) = run(&format!("{train} --init {zip}/model.ply"), 3);
-    assert!(stderr.contains("model.ply: is within") && stderr.contains("extract it"), "{stderr}");
+    folder.write("long.ply", "no model");
+    fs::File::options()
+        .write(true)
+        .open(folder.join("long.ply"))
+        .unwrap()
+        .set_len(1 << 43)
+        .unwrap();
+    let parts = ["long.ply", "neither PLY, SPZ nor SOG"];
+    folder.refused("edit @long.ply --up 0,-1,0 --out x.ply", 3, &parts);
+    folder.write("scan.zip", "PK");
+    let set = fixture().named("@set");
+    let train = format!("train {set} --out @run --steps 1 --plan none --init @scan.zip/model.ply");
+    says(&folder.run(&train, 3).1, &["model.ply: is within", "extract it"]);
 }
 
 #[test]
 fn the_number_of_steps_has_short_forms_and_the_alias_iterations() {
-    let folder = tempfile::tempdir().unwrap();
-    let train = format!("train {} --out {}", fixture().set(), folder.path().join("run").display());
     for (option, steps) in [("--steps 1e4", 10_000), ("--steps 5k", 5000), ("--iterations 7", 7)] {
-        let (message, _) = run(&format!("{train} --explain {option}"), 0);
+        let (message, _) = fixture().run(&format!("train @set --out @no --explain {option}"), 0);
         assert!(message.contains(&format!("steps = {steps}  (--steps)")), "{option}: {message}");
     }
-    let twice = format!("{train} --steps 5 --iterations 7");
-    refused(&twice, 2, &["--steps", "multiple times"]);
 }
 
 #[test]
 fn a_configuration_with_an_unknown_key_or_a_value_of_nan_names_it_and_its_file() {
-    let folder = tempfile::tempdir().unwrap();
-    let config = folder.path().join("config.toml");
-    let arguments = format!("--config {}", config.display());
-    let set = fixture().set();
-    for (text, parts) in [
-        ("steps = 3\nstepz = 4\n", ["stepz", "(line 2)"]),
-        ("[schedule.initial_rates]\nquats = nan\n", ["schedule.initial_rates.quats is nan", ""]),
-    ] {
-        fs::write(&config, text).unwrap();
-        refuses_to_train(Path::new(&set), &arguments, 3, &[&["config.toml"][..], &parts].concat());
-    }
+    let folder = copied_set();
+    folder.write("stepz/config.toml", "steps = 3\nstepz = 4\n");
+    folder.write("nan/config.toml", "[schedule.initial_rates]\nquats = nan\n");
+    let table = "
+        3 | TRAIN --config @stepz/config.toml | config.toml & stepz & (line 2)
+        3 | TRAIN --config @nan/config.toml | config.toml & schedule.initial_rates.quats is nan";
+    refuses_all(&folder, table);
 }
 
 #[test]
 fn every_setting_is_explained_with_its_origin_and_nothing_is_trained() {
-    let folder = tempfile::tempdir().unwrap();
-    let (file, run) = (folder.path().join("a.toml"), folder.path().join("run"));
-    fs::write(&file, "near = 0.2\nsteps = 3\n").unwrap();
-    let explained = |options: &str| {
-        let train = format!("train {} --out {} --explain", fixture().set(), run.display());
-        crate::common::command::run(&format!("{train} {options}"), 0).0
-    };
-    let message = explained("--preset draft --seed 4 --set stop.margin=1");
-    for line in [
+    let folder = copied_set();
+    folder.write("a.toml", "near = 0.2\nsteps = 3\n");
+    let explained =
+        |options: &str| folder.succeed(&format!("train @set --out @run --explain {options}"));
+    let lines = [
         "steps = 400  (preset draft)\n",
         "seed = 4  (--seed)\n",
         "stop.margin = 1.0  (--set)\n",
         "exposure.learn = false  (plan)\n",
         "ssim_weight = 0.2  (default)\n    Weight of the loss 1 - SSIM",
-    ] {
-        assert!(message.contains(line), "no {line} in {message}");
-    }
-    let message = explained(&format!("--preset draft --config {} --steps 5", file.display()));
-    assert!(message.contains(&format!("near = 0.2  ({})\n", file.display())), "{message}");
-    assert!(
-        message.contains("steps = 5  (--steps)\n")
-            && message.contains("sh_degree = 0  (preset draft)"),
-        "{message}"
-    );
-    assert!(!run.exists());
+    ];
+    says(&explained("--preset draft --seed 4 --set stop.margin=1"), &lines);
+    let near = folder.named("near = 0.2  (@a.toml)\n");
+    let lines = [&near[..], "steps = 5  (--steps)\n", "sh_degree = 0  (preset draft)"];
+    says(&explained("--preset draft --config @a.toml --steps 5"), &lines);
+    assert!(!folder.join("run").exists());
 }
 
 #[test]
 fn an_unknown_device_and_no_device_are_refused_with_the_remedy() {
-    let set = fixture().set();
-    refuses_to_train(Path::new(&set), "--device voodoo", 4, &["voodoo", "there are: "]);
-    refuses_to_train(Path::new(&set), "--device 99", 4, &["number 99", "there are: "]);
+    let table = "
+        4 | TRAIN --device voodoo | voodoo & there are:
+        4 | TRAIN --device 99     | number 99 & there are:";
+    refuses_all(fixture(), table);
     let nothing =
         [("VK_DRIVER_FILES", "/nonexistent.json"), ("VK_ICD_FILENAMES", "/nonexistent.json")];
     for arguments in ["doctor", "bench", "demo --out /nonexistent/demo"] {
@@ -361,35 +314,28 @@ fn a_validation_message_fails_the_command() {
     }
     // Advice on best practices, which the code does not follow, is reported in every run.
     let advice = "VK_VALIDATION_FEATURE_ENABLE_BEST_PRACTICES_EXT";
-    let photograph = crate::common::fixture("lom/low/000.png");
-    let out = tempfile::tempdir().unwrap();
-    let arguments = format!("tone apply {} --out {}", photograph.display(), out.path().display());
-    let output = command(&arguments).env("VK_LAYER_ENABLES", advice).output().unwrap();
+    let apply = format!("tone apply {} --out @", committed("lom/low/000.png").display());
+    let folder = Folder::empty();
+    let output = folder.command(&apply).env("VK_LAYER_ENABLES", advice).output().unwrap();
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(101), "{stderr}");
-    assert!(stderr.contains("validation failed in\nmain: "), "{stderr}");
+    says(&stderr, &["validation failed in\nmain: "]);
 }
 
 #[test]
 fn eval_and_render_refuse_a_folder_without_a_finished_run() {
-    let folder = tempfile::tempdir().unwrap();
-    let run = folder.path().display();
-    for command in ["eval", "render --split all --out x"] {
-        let (command, options) = command.split_once(' ').unwrap_or((command, ""));
-        refused(&format!("{command} {run} {options}"), 3, &["no config.toml", "nightsplat train"]);
-    }
-    let config = fs::read_to_string(fixture().path("run/config.toml")).unwrap();
-    let moved = folder.path().join("moved");
-    fs::write(
-        folder.path().join("config.toml"),
-        config.replace(&fixture().set(), &moved.display().to_string()),
-    )
-    .unwrap();
-    refused(&format!("eval {run}"), 3, &["model.ply", "neither finished"]);
-    let model = fs::read(fixture().path("run/model.ply")).unwrap();
-    fs::write(folder.path().join("model.ply"), &model).unwrap();
-    refused(&format!("eval {run}"), 3, &["config.toml", "moved", "--dataset"]);
-    fs::write(folder.path().join("config.toml"), config).unwrap();
-    fs::write(folder.path().join("model.ply"), &model[..model.len() / 2]).unwrap();
-    refused(&format!("eval {run}"), 3, &["model.ply"]);
+    let folder = Folder::empty();
+    let none = "
+        3 | eval @                         | no config.toml & nightsplat train
+        3 | render @ --split all --out x | no config.toml & nightsplat train";
+    folder.refuses_all(none);
+    let config = fixture().text("run/config.toml");
+    folder.write("config.toml", config.replace(&fixture().named("@set"), &folder.named("@moved")));
+    folder.refused("eval @", 3, &["model.ply", "neither finished"]);
+    let model = fixture().model("run");
+    folder.write("model.ply", &model);
+    folder.refused("eval @", 3, &["config.toml", "moved", "--dataset"]);
+    folder.write("config.toml", config);
+    folder.write("model.ply", &model[..model.len() / 2]);
+    folder.refused("eval @", 3, &["model.ply"]);
 }

@@ -10,20 +10,18 @@ mod hostile;
 use std::io::Write;
 use std::ops::Range;
 
-use glam::DVec2;
-use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{CheckReport, Gpu};
+use nightsplat::gpu::CheckReport;
 use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::gaussian::Planes;
 use nightsplat::reference::project::{ProjectionSettings, project_gaussian};
-use nightsplat::splats::render::RenderSettings;
-use nightsplat::splats::scene::{ATTRIBUTES, Gaussians};
-use nightsplat::train::{TrainConfig, Trainer};
+use nightsplat::splats::scene::ATTRIBUTES;
 use nightsplat::{kernels, reference};
-use nightsplat_core::camera::{Camera, Patch};
+use nightsplat_core::camera::Patch;
 
 use cases::{CASES, Case, Effort, Expect};
 use hostile::Hostile;
+
+use crate::common::prelude::*;
 
 /// Runs every second of the quick rows, so that the cores share them.
 fn run_half(half: usize) {

@@ -1,29 +1,31 @@
 //! A sweep trains every point once, survives being killed, and always ranks its points in the same way.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
-use std::sync::OnceLock;
-use std::time::{Duration, Instant};
+use std::ops::Deref;
 
-use serde_json::Value;
-
-use crate::common::command::{command, refused, run};
+use crate::common::command::{Folder, command, json, refused, run, says};
+use crate::common::prelude::*;
 
 /// The smallest dataset with views to score.
 fn set() -> &'static Path {
-    static SET: OnceLock<tempfile::TempDir> = OnceLock::new();
+    static SET: OnceLock<Folder> = OnceLock::new();
     SET.get_or_init(|| {
-        let folder = tempfile::tempdir().unwrap();
-        run(&format!("synth {} --views 9 --width 24 --height 16", folder.path().display()), 0);
+        let folder = Folder::empty();
+        folder.succeed("synth @ --views 9 --width 24 --height 16");
         folder
     })
-    .path()
 }
 
 struct Sweep {
-    folder: tempfile::TempDir,
+    folder: Folder,
     arguments: String,
+}
+
+impl Deref for Sweep {
+    type Target = Folder;
+
+    fn deref(&self) -> &Folder {
+        &self.folder
+    }
 }
 
 impl Sweep {
@@ -32,22 +34,14 @@ impl Sweep {
     }
 
     fn with_dataset(set: &Path, options: &str) -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let (set, out) = (set.display(), folder.path().display());
+        let folder = Folder::empty();
+        let (set, out) = (set.display(), folder.display());
         Self { arguments: format!("sweep {set} --out {out} {options}"), folder }
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    fn read(&self, name: &str) -> String {
-        fs::read_to_string(self.path(name)).unwrap()
     }
 
     /// The results that must not depend on how the sweep was run.
     fn leaderboard(&self) -> [String; 3] {
-        ["leaderboard.csv", "leaderboard.md", "index.html"].map(|name| self.read(name))
+        ["leaderboard.csv", "leaderboard.md", "index.html"].map(|name| self.text(name))
     }
 
     /// The names of the remaining points.
@@ -64,6 +58,15 @@ impl Sweep {
         let (lines, _) = run(&format!("{} --dry-run", self.arguments), 0);
         lines.lines().map(str::to_owned).collect()
     }
+
+    /// Whether these points are trained again by another run of the sweep, and its standard output.
+    fn trained_again<const N: usize>(&self, points: [&str; N], more: &str) -> ([bool; N], String) {
+        let time = |point| fs::metadata(self.path(point).join("model.ply")).unwrap().modified();
+        let before = points.map(|point| time(point).unwrap());
+        let (stdout, _) = run(&format!("{} {more}", self.arguments), 0);
+        let mut before = before.into_iter();
+        (points.map(|point| Some(time(point).unwrap()) != before.next()), stdout)
+    }
 }
 
 /// As when a new version is installed during a sweep.
@@ -71,7 +74,7 @@ impl Sweep {
 #[test]
 fn a_sweep_survives_the_replacement_of_its_program() {
     let sweep = Sweep::new("--steps 2 --curves linear,ase");
-    let program = sweep.folder.path().with_extension("program");
+    let program = sweep.folder.with_extension("program");
     fs::copy(command("").get_program(), &program).unwrap();
     let mut sweeping = Command::new(&program)
         .args(sweep.arguments.split_whitespace())
@@ -113,12 +116,11 @@ fn a_finished_point_is_never_trained_twice_and_a_killed_one_is_resumed() {
     assert!(lines.len() == 3 && psnr(lines[1]) >= psnr(lines[2]), "{csv}");
     assert!(markdown.contains("| curve | PSNR, dB | sd |"), "{markdown}");
     assert_eq!(html.matches("<rect").count(), 2, "a bar per curve");
-    let costs = sweep.read("costs.csv");
+    let costs = sweep.text("costs.csv");
     assert!(costs.lines().count() == 3 && costs.contains(",2,"), "{costs}");
     // The mean over the seeds and their spread are those of the runs.
     let scores = [1, 2].map(|seed| {
-        let text = sweep.read(&format!("curve=ase,seed={seed}/metrics.json"));
-        let metrics: Value = serde_json::from_str(&text).unwrap();
+        let metrics = sweep.json(&format!("curve=ase,seed={seed}/metrics.json"));
         metrics["mean"]["psnr"].as_f64().unwrap()
     });
     let ase: Vec<&str> =
@@ -130,15 +132,8 @@ fn a_finished_point_is_never_trained_twice_and_a_killed_one_is_resumed() {
     // As if it had been killed while the second point was trained.
     fs::remove_file(sweep.path(points[1]).join("metrics.json")).unwrap();
     fs::remove_file(sweep.path("index.html")).unwrap();
-    let trained = |point: &str| {
-        fs::metadata(sweep.path(point).join("model.ply")).unwrap().modified().unwrap()
-    };
-    let before = points.map(trained);
     assert_eq!(sweep.left(), left[1..2]);
-    run(&sweep.arguments, 0);
-    let again: Vec<bool> =
-        points.iter().zip(before).map(|(point, before)| trained(point) != before).collect();
-    assert_eq!(again, [false, true, false, false]);
+    assert_eq!(sweep.trained_again(points, "").0, [false, true, false, false]);
     assert_eq!(sweep.leaderboard(), leaderboard);
     assert!(sweep.left().is_empty());
 }
@@ -171,12 +166,10 @@ fn a_sweep_killed_twice_ends_like_one_run_by_a_scheduler() {
     run(&killed.arguments, 0);
     assert_eq!(killed.leaderboard(), scheduled.leaderboard());
     for (line, point) in left.iter().zip(["curve=ap3,gain=0.5", "curve=linear,gain=0.5"]) {
-        let log = killed.read(&format!("{point}/log.txt"));
+        let log = killed.text(&format!("{point}/log.txt"));
         assert_eq!(log.lines().next(), Some(line.as_str()), "what runs is what --dry-run says");
-        assert_eq!(killed.read(&format!("{point}/train.csv")).lines().count(), 61);
-        let models =
-            [&killed, &scheduled].map(|sweep| fs::read(sweep.path(point).join("model.ply")));
-        assert!(models[0].as_ref().unwrap() == models[1].as_ref().unwrap(), "{point}");
+        assert_eq!(killed.text(&format!("{point}/train.csv")).lines().count(), 61);
+        assert!(killed.model(point) == scheduled.model(point), "{point}");
     }
 }
 
@@ -185,9 +178,8 @@ fn a_point_that_fails_is_reported_and_the_others_finish() {
     let sweep = Sweep::new("--steps 2 --grid device=\"\",voodoo,0");
     let (shown, message) = run(&sweep.arguments, 1);
     assert!(shown.contains("voodoo"), "{shown}");
-    for part in ["device=voodoo failed", "there are: ", "error: 1 of 3 points failed", "log.txt"] {
-        assert!(message.contains(part), "no `{part}` in: {message}");
-    }
+    let parts = ["device=voodoo failed", "there are: ", "error: 1 of 3 points failed", "log.txt"];
+    says(&message, &parts);
     let [csv, markdown, html] = sweep.leaderboard();
     assert_eq!(csv.lines().filter(|line| line.ends_with(",1")).count(), 2, "{csv}");
     assert_eq!(csv.lines().last(), Some("voodoo,,,,,0"), "what failed comes last");
@@ -205,20 +197,18 @@ fn the_offset_sweep_marks_the_adaptive_black_level() {
     assert!(csv.starts_with("offset,psnr,psnr_channel_mean,ssim,gaussians,runs\n"), "{csv}");
     assert_eq!((html.matches("<circle").count(), html.matches("<path").count()), (2, 1), "{html}");
     assert!(html.contains("adaptive 0."), "{html}");
-    let config = |point: &str| sweep.read(&format!("curve=ap3,offset={point}/config.toml"));
     for (point, lines) in [
         ("0.1", ["\nalpha = 0.1  # --set\n", "\nbeta = 0.0  # --set\n"]),
         ("adaptive", ["\nalpha = 0.12  # the curve's\n", "\nbeta = 2.5  # default\n"]),
     ] {
-        let config = config(point);
-        assert!(lines.iter().all(|line| config.contains(line)), "{config}");
+        says(&sweep.text(&format!("curve=ap3,offset={point}/config.toml")), &lines);
     }
 }
 
 #[test]
 fn tables_and_all_curves_are_grids() {
     let lines = |options: &str| Sweep::new(options).left();
-    let curves = nightsplat_photographs::tone::ToneCurve::ALL.len();
+    let curves = ToneCurve::ALL.len();
     assert_eq!(lines("--curves all").len(), curves);
     assert_eq!(lines("--table leaderboard --seeds 1,2").len(), 2 * curves);
     assert_eq!(lines("--table offset").len(), 10);
@@ -244,9 +234,9 @@ fn values_may_be_added_to_a_sweep_but_not_another_sweep() {
     refused(&arguments.replace("--steps 1", "--steps 2"), 1, &run_differs);
     let sweep_differs = ["another sweep", "lists = [\"curve\"]", "--out"];
     refused(&format!("{arguments} --alpha 0.1"), 1, &sweep_differs);
-    let two = tempfile::tempdir().unwrap();
-    run(&format!("synth {} --views 9 --width 24 --height 16", two.path().display()), 0);
-    let other = arguments.replace(set().to_str().unwrap(), two.path().to_str().unwrap());
+    let two = Folder::empty();
+    two.succeed("synth @ --views 9 --width 24 --height 16");
+    let other = arguments.replace(set().to_str().unwrap(), two.to_str().unwrap());
     refused(&other, 1, &["another", "--out"]);
     // A foreign folder.
     fs::remove_file(wider.path("sweep.toml")).unwrap();
@@ -255,46 +245,41 @@ fn values_may_be_added_to_a_sweep_but_not_another_sweep() {
 
 #[test]
 fn misuse_is_refused_before_anything_is_trained() {
-    let refused = |options: &str, code: i32, parts: &[&str]| {
-        let sweep = Sweep::new(options);
-        refused(&sweep.arguments, code, parts);
-        assert_eq!(fs::read_dir(sweep.folder.path()).unwrap().count(), 0, "{options}");
-    };
-    refused("", 2, &["grid is empty", "--curves"]);
-    refused("--alpha 0.1,,0.2", 2, &["alpha", "empty"]);
-    refused("--grid tone.alhpa=0.1", 2, &["tone.alhpa", "tone.alpha"]);
-    refused("--grid downscale=2,4", 2, &["downscale", "resolution_steps"]);
-    refused("--presets fast,slow", 2, &["slow", "draft"]);
-    refused("--table parts --model lita", 2, &["leave out --model"]);
-    refused("--grid steps", 2, &["--grid steps", "KEY=V1,V2"]);
-    refused("--grid steps=many", 2, &["steps (--steps) is \"many\"", "a whole number"]);
-    refused("--curves ap3,sepia", 2, &["curve=sepia", "unknown curve", "linear"]);
-    refused("--alpha 0.1,0.10", 2, &["alpha=0.1 and alpha=0.10", "same run"]);
-    refused("--alpha 0.1 --offset 0.1", 2, &["--offset"]);
-    refused("--alpha 2", 2, &["alpha is 2"]);
-    refused("--steps no --curves all", 2, &["--steps"]);
-    refused("--curves all --jobs 0", 2, &["--jobs"]);
-    refused("--curves all --device voodoo", 4, &["voodoo"]);
-    refused("--curves all --reference nowhere", 3, &["nowhere"]);
-    let nowhere = tempfile::tempdir().unwrap().path().join("set");
-    let arguments = format!("sweep {0} --out {0}/out --curves all", nowhere.display());
-    let (_, message) = run(&arguments, 3);
-    assert!(message.contains("is not a folder") && !nowhere.exists(), "{message}");
+    let sweep = Sweep::new("");
+    let table = "
+        2 | SWEEP | grid is empty & --curves
+        2 | SWEEP --alpha 0.1,,0.2 | alpha & empty
+        2 | SWEEP --grid tone.alhpa=0.1 | tone.alhpa & tone.alpha
+        2 | SWEEP --grid downscale=2,4 | downscale & resolution_steps
+        2 | SWEEP --presets fast,slow | slow & draft
+        2 | SWEEP --table parts --model lita | leave out --model
+        2 | SWEEP --grid steps | --grid steps & KEY=V1,V2
+        2 | SWEEP --grid steps=many | steps (--steps) is \"many\" & a whole number
+        2 | SWEEP --curves ap3,sepia | curve=sepia & unknown curve & linear
+        2 | SWEEP --alpha 0.1,0.10 | alpha=0.1 and alpha=0.10 & same run
+        2 | SWEEP --alpha 0.1 --offset 0.1 | --offset
+        2 | SWEEP --alpha 2 | alpha is 2
+        2 | SWEEP --steps no --curves all | --steps
+        2 | SWEEP --curves all --jobs 0 | --jobs
+        4 | SWEEP --curves all --device voodoo | voodoo
+        3 | SWEEP --curves all --reference nowhere | nowhere";
+    sweep.refuses_all(&table.replace("SWEEP", &sweep.arguments));
+    assert_eq!(fs::read_dir(&sweep.folder).unwrap().count(), 0);
+    let (_, message) = sweep.run("sweep @nowhere --out @nowhere/out --curves all", 3);
+    assert!(message.contains("is not a folder") && !sweep.path("nowhere").exists(), "{message}");
 
     // A dataset of one photograph has none to score.
-    let one = tempfile::tempdir().unwrap();
-    run(&format!("synth {} --views 2 --width 24 --height 16", one.path().display()), 0);
+    let one = Folder::empty();
+    one.succeed("synth @ --views 2 --width 24 --height 16");
     for name in ["transforms_test.json", "transforms_val.json"] {
-        let path = one.path().join(name);
-        let mut list: Value = serde_json::from_str(&fs::read_to_string(&path).unwrap()).unwrap();
-        list["frames"] = Value::Array(vec![]);
-        fs::write(path, list.to_string()).unwrap();
+        let mut list = one.json(name);
+        list["frames"] = serde_json::json!([]);
+        one.write(name, list.to_string());
     }
-    let sweep = Sweep::with_dataset(one.path(), "--steps 2 --curves ap3");
+    let sweep = Sweep::with_dataset(&one, "--steps 2 --curves ap3");
     let (_, message) = run(&sweep.arguments, 3);
-    let line = message.lines().last().unwrap();
-    assert!(line.contains(one.path().to_str().unwrap()), "{line}");
-    assert!(line.contains("no held-out view to score"), "{line}");
+    let parts = [one.to_str().unwrap(), "no held-out view to score"];
+    says(message.lines().last().unwrap(), &parts);
     assert!(!sweep.path("sweep.toml").exists());
 }
 
@@ -308,44 +293,36 @@ fn presets_are_trained_by_their_plans_scored_during_training_and_compared() {
     let points = ["preset=draft", "preset=paper", "preset=balanced"];
     assert_eq!(sweep.names(), points);
     let (shown, _) = run(&sweep.arguments, 0);
-    for part in ["PSNR, dB", "processor time, s", "device, MiB", "balanced", "index.html"] {
-        assert!(shown.contains(part), "no `{part}` in: {shown}");
-    }
-    let csv = sweep.read("costs.csv");
+    says(&shown, &["PSNR, dB", "processor time, s", "device, MiB", "balanced", "index.html"]);
+    let csv = sweep.text("costs.csv");
     assert!(csv.starts_with("preset,runs,psnr,psnr_sd,") && csv.lines().count() == 4, "{csv}");
-    let way = sweep.read("preset=draft/evals.csv");
+    let way = sweep.text("preset=draft/evals.csv");
     let seconds: Vec<f64> =
         way.lines().skip(1).map(|line| line.split(',').nth(5).unwrap().parse().unwrap()).collect();
     assert!(seconds.len() == 3 && seconds.is_sorted() && seconds[0] > 0.0, "{way}");
-    let metrics: Value = serde_json::from_str(&sweep.read("preset=draft/metrics.json")).unwrap();
+    let metrics = sweep.json("preset=draft/metrics.json");
     let whole = metrics["seconds"].as_f64().unwrap();
     assert!((whole - seconds[2]).abs() < 1e-3, "{whole} {way}");
     assert!(metrics["spent"]["device_bytes"].as_u64().unwrap() > 1000, "{metrics}");
-    let html = sweep.read("costs.html");
+    let html = sweep.text("costs.html");
     assert!(html.contains("during training") && html.contains("The difference to preset balanced"));
     for outside in ["http:", "https:", "<script", "<link", "@import", "url("] {
         assert!(!html.contains(outside), "{outside}");
     }
     let at = |what: &str| html.find(what).unwrap();
     assert!(at("<svg") < at("<table"), "plots before tables");
-    assert!(sweep.read("preset=paper/log.txt").contains("--plan none"));
+    assert!(sweep.text("preset=paper/log.txt").contains("--plan none"));
     assert!(sweep.path("preset=draft/plan.toml").is_file());
 
     // As if it had been killed while a point was trained: that point is trained again, to the same bits.
-    let model = |point: &str| fs::read(sweep.path(point).join("model.ply")).unwrap();
-    let trained = |point: &str| {
-        fs::metadata(sweep.path(point).join("model.ply")).unwrap().modified().unwrap()
-    };
-    let (bits, before, leaderboard) = (model(points[0]), points.map(trained), sweep.leaderboard());
+    let (bits, leaderboard) = (sweep.model(points[0]), sweep.leaderboard());
     fs::remove_file(sweep.path(points[0]).join("metrics.json")).unwrap();
     assert_eq!(sweep.names(), points[..1]);
-    let (json, _) = run(&format!("{} --json", sweep.arguments), 0);
-    let again: Vec<bool> =
-        points.iter().zip(before).map(|(point, before)| trained(point) != before).collect();
+    let (again, printed) = sweep.trained_again(points, "--json");
     assert_eq!(again, [true, false, false]);
-    assert!(bits == model(points[0]), "the same seed, the same bits");
+    assert!(bits == sweep.model(points[0]), "the same seed, the same bits");
     assert_eq!(sweep.leaderboard(), leaderboard);
-    let json: Value = serde_json::from_str(&json).unwrap();
+    let json = json(printed);
     let points = json["points"].as_array().unwrap();
     let find = |name: &str| points.iter().find(|point| point["point"] == name).unwrap();
     let psnr = |name: &str| find(name)["mean"]["psnr"].as_f64().unwrap();
@@ -359,35 +336,28 @@ fn presets_are_trained_by_their_plans_scored_during_training_and_compared() {
 
 #[test]
 fn without_references_test_views_are_scored_against_their_own_targets() {
-    let copy = tempfile::tempdir().unwrap();
-    let status = Command::new("cp").arg("-r").arg(set()).arg(copy.path()).status().unwrap();
-    assert!(status.success());
-    let root = copy.path().join(set().file_name().unwrap());
+    let root = Folder::copy_of(set());
     fs::remove_dir_all(root.join("high")).unwrap();
     let sweep = Sweep::with_dataset(&root, "--presets draft --steps 2 --json");
-    let (json, _) = run(&sweep.arguments, 0);
-    let json: Value = serde_json::from_str(&json).unwrap();
+    let json = json(run(&sweep.arguments, 0).0);
     let point = &json["points"][0];
     assert!(point["scored"].as_str().unwrap().contains("pseudo-GT"), "{json}");
     assert!(point["mean"]["psnr"].as_f64().unwrap() > 3.0, "{json}");
     for page in ["index.html", "costs.html"] {
-        assert!(sweep.read(page).contains("pseudo-GT"), "{page}");
+        assert!(sweep.text(page).contains("pseudo-GT"), "{page}");
     }
     assert!(sweep.left().is_empty());
 }
 
 #[test]
 fn train_sets_any_setting_by_its_path() {
-    let folder = tempfile::tempdir().unwrap();
-    let (set, out) = (set().display(), folder.path().join("run"));
-    let train = format!("train {set} --out {}", out.display());
-    let (_, message) = run(&format!("{train} --set density.grad=1"), 2);
-    assert!(message.contains("density.grad") && message.contains("nearest"), "{message}");
-    run(&format!("{train} --steps 9 --set steps=1 --set tone.alpha=0.2 --set background=black"), 0);
-    let config = fs::read_to_string(out.join("config.toml")).unwrap();
-    for line in
-        ["steps = 1  # --set\n", "alpha = 0.2  # --set\n", "background = \"black\"  # --set\n"]
-    {
-        assert!(config.contains(line), "{config}");
-    }
+    let folder = Folder::empty();
+    let train = format!("train {} --out @run", set().display());
+    let (_, message) = folder.run(&format!("{train} --set density.grad=1"), 2);
+    says(&message, &["density.grad", "nearest"]);
+    let settings = "--steps 9 --set steps=1 --set tone.alpha=0.2 --set background=black";
+    folder.succeed(&format!("{train} {settings}"));
+    let lines =
+        ["steps = 1  # --set\n", "alpha = 0.2  # --set\n", "background = \"black\"  # --set\n"];
+    says(&folder.text("run/config.toml"), &lines);
 }

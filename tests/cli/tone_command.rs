@@ -1,14 +1,12 @@
 //! `nightsplat tone`, in process.
 
-use std::path::{Path, PathBuf};
-
 use clap::Parser as _;
 use nightsplat::cli::tone::apply::{ApplyArgs, ToneReport, apply};
-use nightsplat_photographs::image::{Image, ImageFile, srgb_from_linear};
+use nightsplat_photographs::image::srgb_from_linear;
 use nightsplat_photographs::metrics::psnr;
-use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
 
 use crate::common::command::succeed;
+use crate::common::prelude::*;
 
 #[derive(Debug, clap::Parser)]
 struct ToneApply {
@@ -37,12 +35,12 @@ fn dark(width: u32, height: u32) -> Image {
 fn a_folder_is_mapped_by_name_and_unreadable_files_are_left_out() {
     let dir = tempfile::tempdir().unwrap();
     let photographs = dir.path().join("photographs");
-    std::fs::create_dir(&photographs).unwrap();
+    fs::create_dir(&photographs).unwrap();
     dark(40, 30).save_png8(photographs.join("a.PNG")).unwrap();
     dark(7, 90).save_png16(photographs.join("b.png")).unwrap();
     dark(16, 16).save_exr(photographs.join("c.exr")).unwrap();
-    std::fs::write(photographs.join("broken.jpg"), b"no image").unwrap();
-    std::fs::write(photographs.join("notes.txt"), b"no image either").unwrap();
+    fs::write(photographs.join("broken.jpg"), b"no image").unwrap();
+    fs::write(photographs.join("notes.txt"), b"no image either").unwrap();
     for curve in [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Hybrid] {
         let out = dir.path().join(curve.name());
         let args = args(&photographs, &out, &format!("--curve {curve} --gain 2 --theta 0.4"));
@@ -106,10 +104,10 @@ fn bad_input_is_named_in_one_line() {
         assert_eq!(error.exit_code(), code, "{message}");
     };
     for folder in ["empty", "all_broken", "twins"] {
-        std::fs::create_dir(path(folder)).unwrap();
+        fs::create_dir(path(folder)).unwrap();
     }
     for name in ["broken.png", "all_broken/a.png", "all_broken/b.png"] {
-        std::fs::write(path(name), b"no image").unwrap();
+        fs::write(path(name), b"no image").unwrap();
     }
     dark(4, 4).save_png8(path("twins/a.png")).unwrap();
     dark(4, 4).save_exr(path("twins/a.exr")).unwrap();
@@ -123,9 +121,9 @@ fn bad_input_is_named_in_one_line() {
         fails(args(&path(name), &out, ""), part, 3);
     }
     dark(4, 4).save_png8(path("good.png")).unwrap();
-    let before = std::fs::read(path("good.png")).unwrap();
+    let before = fs::read(path("good.png")).unwrap();
     fails(args(&path("good.png"), dir.path(), ""), "is one of the photographs", 1);
-    assert_eq!(std::fs::read(path("good.png")).unwrap(), before);
+    assert_eq!(fs::read(path("good.png")).unwrap(), before);
 
     fails(args(&path("good.png"), &path("broken.png"), ""), "cannot be created", 1);
     fails(args(&path("good.png"), &out, "--gain=-1"), "tone.gain_c", 2);
@@ -136,7 +134,7 @@ fn bad_input_is_named_in_one_line() {
 fn pairs(dir: &Path) -> [PathBuf; 2] {
     let folders = ["dark", "bright"].map(|name| dir.join(name));
     for (folder, gain) in folders.iter().zip([1.0, 6.0]) {
-        std::fs::create_dir(folder).unwrap();
+        fs::create_dir(folder).unwrap();
         for (name, shift) in [("a", 0), ("b", 5), ("c", 9)] {
             let mut image = dark(40 + shift, 30);
             image.data.iter_mut().for_each(|value| *value *= gain);
@@ -161,7 +159,7 @@ fn references_give_scores_and_the_page_shows_the_distributions() {
     let scores: Vec<f64> = output.views.values().map(|view| view.scores.unwrap().psnr).collect();
     let mean = scores.iter().sum::<f64>() / 3.0;
     assert!((output.scene.scores.unwrap().psnr - mean).abs() < 1e-9 && mean > 10.0);
-    let html = std::fs::read_to_string(&page).unwrap();
+    let html = fs::read_to_string(&page).unwrap();
     for name in ["photograph", "ap3", "linear", "lum_preserve", "reference"] {
         assert!(html.contains(&format!("{name} (skewness")), "{name}");
     }
@@ -183,18 +181,18 @@ fn references_give_scores_and_the_page_shows_the_distributions() {
 fn the_page_shows_every_photograph_and_tables_have_what_the_curve_uses() {
     let dir = tempfile::tempdir().unwrap();
     let folder = dir.path().join("dark");
-    std::fs::create_dir(&folder).unwrap();
+    fs::create_dir(&folder).unwrap();
     for name in ["1", "2", "10", "11", "9"] {
         dark(40, 30).save_png8(folder.join(format!("{name}.png"))).unwrap();
     }
     let table = dir.path().join("curve.csv");
-    std::fs::write(&table, "0,0\n1,0.7\n2,1\n").unwrap();
+    fs::write(&table, "0,0\n1,0.7\n2,1\n").unwrap();
     let (page, folder) = (dir.path().join("page.html"), folder.display());
     let printed = |curve: &str| {
         succeed(&format!("tone apply {folder} --curve {curve} --report {}", page.display()))
     };
     let ap3 = printed("ap3");
-    let html = std::fs::read_to_string(&page).unwrap();
+    let html = fs::read_to_string(&page).unwrap();
     assert_eq!(html.matches("data:image/jpeg").count(), 10, "five photographs, dark and lit");
     for text in [&ap3, &html] {
         let at = |name: &str| text.find(name).unwrap();
@@ -240,8 +238,7 @@ fn scene_statistics_give_every_photograph_one_curve() {
 fn a_dataset_is_measured_on_training_views_and_scored_on_test_views() {
     let dir = tempfile::tempdir().unwrap();
     let set = dir.path().join("set");
-    let options =
-        nightsplat_synth::SyntheticOptions { width: 48, height: 36, ..Default::default() };
+    let options = SyntheticOptions { width: 48, height: 36, ..Default::default() };
     nightsplat_synth::write(&set, &options).unwrap();
     let output = apply(&automatic(&set, "--curve ap3")).unwrap();
     assert!(output.scene.scores.is_some());
@@ -279,7 +276,7 @@ fn values_that_are_not_finite_are_counted_and_excluded_from_the_statistics() {
 fn degenerate_photographs_have_defined_results_under_every_kind_of_curve() {
     let dir = tempfile::tempdir().unwrap();
     let photographs = dir.path().join("photographs");
-    std::fs::create_dir(&photographs).unwrap();
+    fs::create_dir(&photographs).unwrap();
     for (name, size, value) in
         [("black", 20, 0.0), ("white", 20, 1.0), ("grey", 20, 0.03), ("pixel", 1, 0.2)]
     {
@@ -288,7 +285,7 @@ fn degenerate_photographs_have_defined_results_under_every_kind_of_curve() {
             .unwrap();
     }
     let table = dir.path().join("curve.csv");
-    std::fs::write(&table, "0,0\n1,0.7\n2,1\n").unwrap();
+    fs::write(&table, "0,0\n1,0.7\n2,1\n").unwrap();
     let named = [
         ToneCurve::Linear,
         ToneCurve::Ap3,
@@ -354,7 +351,7 @@ fn targets_of_linear_light_are_equally_bright_for_any_exposure() {
     let target = |exposure: f32| {
         let [folder, out] =
             ["dark", "out"].map(|name| dir.path().join(format!("{name}{exposure}")));
-        std::fs::create_dir(&folder).unwrap();
+        fs::create_dir(&folder).unwrap();
         let photograph =
             Image::from_fn(40, 30, |x, y| [srgb_from_linear(exposure * light(x, y)); 3]);
         photograph.save_exr(folder.join("a.exr")).unwrap();
@@ -380,7 +377,7 @@ fn targets_of_linear_light_are_equally_bright_for_any_exposure() {
 fn a_well_lit_folder_is_unchanged_and_a_black_one_refused() {
     let dir = tempfile::tempdir().unwrap();
     let folder = dir.path().join("bright");
-    std::fs::create_dir(&folder).unwrap();
+    fs::create_dir(&folder).unwrap();
     let bright = Image::from_fn(40, 30, |x, y| [x, y, x + y].map(|v| 0.3 + v as f32 / 120.0));
     bright.save_png8(folder.join("a.png")).unwrap();
     let out = dir.path().join("out");
@@ -409,7 +406,7 @@ fn a_well_lit_folder_is_unchanged_and_a_black_one_refused() {
 /// dB.
 #[test]
 fn the_automatic_curve_has_its_known_scores() {
-    let Some(lom) = crate::common::shared("data/lom") else { return };
+    let Some(lom) = shared("data/lom") else { return };
     let mut mean = 0.0;
     for (scene, known) in [("chair", 25.87), ("sofa", 30.04), ("shrub", 19.59)] {
         let output = apply(&automatic(&lom.join(scene), "")).unwrap();

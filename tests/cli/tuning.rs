@@ -1,36 +1,23 @@
 //! `bench --tune`, its file, and the tiles that training takes from it.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-
-use crate::common::command::{command, refused, succeed};
+use crate::common::command::{Folder, json};
+use crate::common::prelude::*;
 use nightsplat::gpu::Tile;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::results::run;
-use nightsplat::splats::render::RenderSettings;
-use serde_json::{Value, json};
+use serde_json::json;
 
 /// A folder with a dataset of dark photographs, whose runs read the fastest tiles from a file next to it.
-struct Workspace(tempfile::TempDir);
+fn workspace() -> Folder {
+    let folder = Folder::empty();
+    folder.succeed("synth @set --views 3 --width 32 --height 24");
+    folder
+}
 
-impl Workspace {
-    fn new() -> Self {
-        let workspace = Self(tempfile::tempdir().unwrap());
-        succeed(&format!(
-            "synth {} --views 3 --width 32 --height 24",
-            workspace.path("set").display()
-        ));
-        workspace
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.0.path().join(name)
-    }
-
+impl Folder {
     /// Standard output and error of a command that must succeed with the file.
-    fn run(&self, arguments: &str) -> (String, String) {
-        let output =
-            command(arguments).env("NIGHTSPLAT_TUNE", self.path("tiles.json")).output().unwrap();
+    fn tuned(&self, arguments: &str) -> (String, String) {
+        let tiles = self.path("tiles.json");
+        let output = self.command(arguments).env("NIGHTSPLAT_TUNE", tiles).output().unwrap();
         let [stdout, stderr] =
             [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
         assert!(output.status.success(), "{arguments}: {stderr}");
@@ -39,9 +26,7 @@ impl Workspace {
 
     /// The standard error of a new run, and the tile that it records.
     fn train(&self, run: &str, more: &str) -> (String, Tile) {
-        let (set, out) = (self.path("set"), self.path(run));
-        let (set, out) = (set.display(), out.display());
-        let (_, stderr) = self.run(&format!("train {set} --out {out} --sh-degree 0 {more}"));
+        let (_, stderr) = self.tuned(&format!("train @set --out @{run} --sh-degree 0 {more}"));
         (stderr, self.recorded(run))
     }
 
@@ -49,8 +34,8 @@ impl Workspace {
         run::load_config(&self.path(run)).unwrap().tile.unwrap()
     }
 
-    fn write(&self, tuning: &Value) {
-        fs::write(self.path("tiles.json"), tuning.to_string()).unwrap();
+    fn keep(&self, tuning: &Value) {
+        self.write("tiles.json", tuning.to_string());
     }
 }
 
@@ -73,9 +58,9 @@ fn unusual() -> Tile {
 
 #[test]
 fn tuning_times_every_supported_tile_and_saves_the_fastest() {
-    let workspace = Workspace::new();
+    let workspace = workspace();
     let arguments = "bench --tune --json --width 64 --height 48 --gaussians 300 --repeats 1";
-    let printed: Value = serde_json::from_str(&workspace.run(arguments).0).unwrap();
+    let printed = json(workspace.tuned(arguments).0);
     let cases = printed["cases"].as_array().unwrap();
     assert_eq!(cases.iter().map(|case| &case["channels"]).collect::<Vec<_>>(), [3, 11]);
     for tile in cases.iter().flat_map(|case| case["tiles"].as_array().unwrap()) {
@@ -84,8 +69,7 @@ fn tuning_times_every_supported_tile_and_saves_the_fastest() {
         assert_eq!(tile["agrees"], true, "{tile}");
         assert!(tile["rasteriser_ms"].as_f64().unwrap() > 0.0, "{tile}");
     }
-    let kept: Value =
-        serde_json::from_slice(&fs::read(workspace.path("tiles.json")).unwrap()).unwrap();
+    let kept = workspace.json("tiles.json");
     assert_eq!(kept["tiles"], printed["tiles"]);
     assert_eq!(kept["driver"], gpu().properties().driver.as_str());
     let chosen: Tile = serde_json::from_value(kept["tiles"][0]["tile"].clone()).unwrap();
@@ -94,42 +78,39 @@ fn tuning_times_every_supported_tile_and_saves_the_fastest() {
 
 #[test]
 fn the_saved_tile_is_used_unless_another_is_set_and_a_resumed_run_keeps_its_own() {
-    let workspace = Workspace::new();
+    let workspace = workspace();
     assert_ne!(unusual(), built_in());
     assert_eq!(workspace.train("none", "--steps 1").1, built_in());
-    workspace.write(&tuning(unusual()));
+    workspace.keep(&tuning(unusual()));
     assert_eq!(workspace.train("kept", "--steps 2 --checkpoint-every 2").1, unusual());
     let [width, height] = built_in().size;
     let asked = format!("--steps 1 --set tile=[{width},{height}]");
     assert_eq!(workspace.train("asked", &asked).1, built_in());
-    workspace.write(&tuning(built_in()));
+    workspace.keep(&tuning(built_in()));
     assert_eq!(workspace.train("kept", "--steps 3 --resume --checkpoint-every 2").1, unusual());
-    workspace.run(&format!("eval {}", workspace.path("kept").display()));
+    workspace.tuned("eval @kept");
     // In the other tests, the command's file is disabled.
-    let (set, out) = (workspace.path("set"), workspace.path("off"));
-    workspace.write(&tuning(unusual()));
-    succeed(&format!("train {} --out {} --steps 1", set.display(), out.display()));
+    workspace.keep(&tuning(unusual()));
+    workspace.succeed("train @set --out @off --steps 1");
     assert_eq!(workspace.recorded("off"), built_in());
 }
 
 #[test]
 fn the_tile_is_recorded_so_that_the_same_file_gives_the_same_bits() {
-    let workspace = Workspace::new();
-    workspace.write(&tuning(unusual()));
+    let workspace = workspace();
+    workspace.keep(&tuning(unusual()));
     workspace.train("first", "--steps 20");
-    workspace.write(&tuning(built_in()));
-    let config = workspace.path("first").join("config.toml");
-    workspace.train("again", &format!("--steps 20 --config {}", config.display()));
-    let model = |run: &str| fs::read(workspace.path(run).join("model.ply")).unwrap();
-    assert_eq!(model("first"), model("again"));
+    workspace.keep(&tuning(built_in()));
+    workspace.train("again", "--steps 20 --config @first/config.toml");
+    assert_eq!(workspace.model("first"), workspace.model("again"));
 }
 
 #[test]
 fn a_damaged_file_and_one_of_another_driver_are_ignored_with_one_line() {
-    let workspace = Workspace::new();
+    let workspace = workspace();
     let mut other = tuning(unusual());
     other["driver"] = json!("of another year");
-    workspace.write(&other);
+    workspace.keep(&other);
     let message = |run: &str, part: &str| {
         let (stderr, tile) = workspace.train(run, "--steps 1");
         assert_eq!(tile, built_in(), "{stderr}");
@@ -138,20 +119,18 @@ fn a_damaged_file_and_one_of_another_driver_are_ignored_with_one_line() {
         assert!(lines[0].contains("bench --tune"), "{stderr}");
     };
     message("driver", "of another year");
-    fs::write(workspace.path("tiles.json"), "{\"device\": ").unwrap();
+    workspace.write("tiles.json", "{\"device\": ");
     message("damaged", "is damaged");
-    workspace.write(&tuning([3, 3].into()));
+    workspace.keep(&tuning([3, 3].into()));
     message("unsuitable", "3x3 tiles do not suit");
 }
 
 #[test]
 fn an_unsupported_tile_is_refused_with_the_remedy() {
-    let workspace = Workspace::new();
-    let (set, out) = (workspace.path("set"), workspace.path("run"));
+    let workspace = workspace();
     for tile in ["[3,3]", "[0,8]", "[4096,4096]", "[4294967295,4294967295]", "[16,16,3]"] {
-        let arguments =
-            format!("train {} --out {} --set tile={tile}", set.display(), out.display());
-        refused(&arguments, 2, &["tiles do not suit", "lanes", "take a tile of"]);
-        assert!(!Path::new(&out).exists());
+        let train = format!("train @set --out @run --set tile={tile}");
+        workspace.refused(&train, 2, &["tiles do not suit", "lanes", "take a tile of"]);
+        assert!(!workspace.path("run").exists());
     }
 }

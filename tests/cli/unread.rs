@@ -1,16 +1,14 @@
 //! Commands whose output has no reader: they do their work all the same.
 #![cfg(unix)]
 
-use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs::File;
 use std::net::{TcpListener, TcpStream};
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
-use std::time::{Duration, Instant};
+use std::process::Output;
 
 use nightsplat::gpu::testing::not_run;
 
-use crate::common::command::{command, exists, succeed};
+use crate::common::command::{Folder, command, exists};
+use crate::common::prelude::*;
 use crate::fixture;
 
 /// What standard error is; standard output is a pipe without a reader then.
@@ -81,16 +79,12 @@ fn files(folder: &Path, inside: &str, found: &mut BTreeMap<String, Vec<u8>>) {
 
 #[test]
 fn commands_that_nobody_reads_write_the_same_files_and_end_with_the_same_code() {
-    let folder = tempfile::tempdir().unwrap();
-    let [set, run_folder, out] = ["set", "run", "out"].map(|name| folder.path().join(name));
-    succeed(&format!("synth {} --views 9 --width 48 --height 36", set.display()));
+    let folder = Folder::empty();
+    let [run_folder, out] = ["run", "out"].map(|name| folder.path(name));
+    folder.succeed("synth @set --views 9 --width 48 --height 36");
     let done = |arguments: &str, error: StandardError| {
         fs::create_dir(&out).unwrap();
-        let paths = [("@set", &set), ("@run", &run_folder), ("@out", &out)];
-        let named = |text: String, (name, path): (&str, &PathBuf)| {
-            text.replace(name, path.to_str().unwrap())
-        };
-        let output = run(&paths.into_iter().fold(arguments.to_owned(), named), error);
+        let output = run(&folder.named(arguments), error);
         let mut found = BTreeMap::new();
         files(&out, "", &mut found);
         if !run_folder.exists() {
@@ -124,8 +118,7 @@ fn a_page_is_served_though_its_address_cannot_be_told() {
     let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
-    let model = fixture().path("run/model.ply");
-    let mut view = command(&format!("view {} --listen {}", model.display(), free.port()));
+    let mut view = fixture().command(&format!("view @run/model.ply --listen {}", free.port()));
     let mut view = view.stdout(Stdio::null()).stderr(writer).spawn().unwrap();
     let begin = Instant::now();
     while TcpStream::connect(free).is_err() && begin.elapsed() < Duration::from_secs(60) {

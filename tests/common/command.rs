@@ -1,9 +1,15 @@
-//! The built binary as a shell runs it.
+//! The built binary as a shell runs it, and folders for its files.
 
+use std::fs;
+use std::ops::Deref;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+
+use serde_json::Value;
 
 /// `nightsplat` with arguments as a shell splits them; paths must not contain spaces. Any validation message fails it.
 pub(crate) fn command(arguments: &str) -> Command {
+    assert!(!arguments.contains('@'), "without the folder of its paths: {arguments}");
     let mut command = Command::new(env!("CARGO_BIN_EXE_nightsplat"));
     // Tests train with the built-in tiles, not those measured on this machine.
     let environment = [("NIGHTSPLAT_FAIL_ON_VALIDATION", "1"), ("NIGHTSPLAT_TUNE", "off")];
@@ -48,6 +54,113 @@ pub(crate) fn refused_with(
     for part in parts {
         assert!(line.contains(part), "{arguments}: no `{part}` in: {line}");
     }
+}
+
+/// The text must contain all of these parts.
+#[track_caller]
+pub(crate) fn says(text: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(text.contains(part), "no `{part}` in: {text}");
+    }
+}
+
+pub(crate) fn json(text: impl AsRef<[u8]>) -> Value {
+    serde_json::from_slice(text.as_ref()).unwrap()
+}
+
+/// A folder for the files of a test, removed with it. In its commands, `@NAME` is the path of NAME in it.
+#[derive(Debug)]
+pub(crate) struct Folder(tempfile::TempDir);
+
+impl Deref for Folder {
+    type Target = Path;
+
+    fn deref(&self) -> &Path {
+        self.0.path()
+    }
+}
+
+impl AsRef<Path> for Folder {
+    fn as_ref(&self) -> &Path {
+        self
+    }
+}
+
+impl Folder {
+    pub(crate) fn empty() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+
+    /// A copy of a folder, beside it.
+    pub(crate) fn copy_of(folder: &Path) -> Self {
+        let copied = Self(tempfile::tempdir_in(folder.parent().unwrap()).unwrap());
+        super::copy(folder, &copied);
+        copied
+    }
+
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.join(name)
+    }
+
+    /// Arguments with the paths that they name.
+    pub(crate) fn named(&self, arguments: &str) -> String {
+        arguments.replace('@', &format!("{}/", self.display()))
+    }
+
+    pub(crate) fn command(&self, arguments: &str) -> Command {
+        command(&self.named(arguments))
+    }
+
+    pub(crate) fn run(&self, arguments: &str, code: i32) -> (String, String) {
+        run(&self.named(arguments), code)
+    }
+
+    pub(crate) fn succeed(&self, arguments: &str) -> String {
+        succeed(&self.named(arguments))
+    }
+
+    pub(crate) fn refused(&self, arguments: &str, code: i32, parts: &[&str]) {
+        refused(&self.named(arguments), code, parts);
+    }
+
+    /// [`refused`] for each line of a table: exit code | arguments | parts of the message, divided by `&`.
+    pub(crate) fn refuses_all(&self, table: &str) {
+        for row in table.lines().map(str::trim).filter(|row| !row.is_empty()) {
+            let cells: Vec<&str> = row.split(" | ").map(str::trim).collect();
+            let [code, arguments, parts] = cells[..] else { panic!("not a row: {row}") };
+            self.refused(arguments, code.parse().unwrap(), &parts.split(" & ").collect::<Vec<_>>());
+        }
+    }
+
+    pub(crate) fn read(&self, name: &str) -> Vec<u8> {
+        fs::read(self.join(name)).unwrap()
+    }
+
+    pub(crate) fn text(&self, name: &str) -> String {
+        fs::read_to_string(self.join(name)).unwrap()
+    }
+
+    pub(crate) fn json(&self, name: &str) -> Value {
+        json(self.read(name))
+    }
+
+    pub(crate) fn write(&self, name: &str, content: impl AsRef<[u8]>) {
+        fs::create_dir_all(self.join(name).parent().unwrap()).unwrap();
+        fs::write(self.join(name), content).unwrap();
+    }
+
+    /// The model of a run.
+    pub(crate) fn model(&self, run: &str) -> Vec<u8> {
+        self.read(&format!("{run}/model.ply"))
+    }
+}
+
+/// The names in a folder, in order.
+pub(crate) fn file_names(folder: impl AsRef<Path>) -> Vec<String> {
+    let names = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name());
+    let mut names: Vec<String> = names.map(|name| name.into_string().unwrap()).collect();
+    names.sort();
+    names
 }
 
 /// A text without the line breaks of its paragraphs.

@@ -8,6 +8,7 @@ pub(crate) mod command;
 pub(crate) mod log;
 pub(crate) mod lpips;
 pub(crate) mod png;
+pub(crate) mod prelude;
 pub(crate) mod safetensors;
 pub(crate) mod setup;
 pub(crate) mod train;

@@ -1,41 +1,39 @@
 //! A folder for runs on a small dataset.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::ops::Deref;
+use std::path::Path;
 
+use super::command::Folder;
 use super::train::small_set;
 
 /// A folder with a dataset of nine small views in `set`, and runs next to it.
-pub(crate) struct Workspace(pub(crate) tempfile::TempDir);
+pub(crate) struct Workspace(Folder);
+
+impl Deref for Workspace {
+    type Target = Folder;
+
+    fn deref(&self) -> &Folder {
+        &self.0
+    }
+}
 
 impl Workspace {
     pub(crate) fn new() -> Self {
-        let workspace = Self(tempfile::tempdir().unwrap());
-        let options = small_set(9, [40, 30], 2);
-        nightsplat_synth::write(workspace.path("set"), &options).unwrap();
-        workspace
-    }
-
-    pub(crate) fn path(&self, name: &str) -> PathBuf {
-        self.0.path().join(name)
+        let folder = Folder::empty();
+        nightsplat_synth::write(folder.path("set"), &small_set(9, [40, 30], 2)).unwrap();
+        Self(folder)
     }
 
     /// The arguments for training on `set` into `name`.
     pub(crate) fn train(&self, name: &str, options: &str) -> String {
-        let (set, out) = (self.path("set"), self.path(name));
-        format!(
-            "train {} --out {} --curve ap3 --model plain --sh-degree 1 --plan none {options}",
-            set.display(),
-            out.display()
-        )
+        let settings = "--curve ap3 --model plain --sh-degree 1 --plan none";
+        self.named(&format!("train @set --out @{name} {settings} {options}"))
     }
 
-    pub(crate) fn read(&self, name: &str) -> Vec<u8> {
-        fs::read(self.path(name)).unwrap()
-    }
-
-    pub(crate) fn model(&self, name: &str) -> Vec<u8> {
-        self.read(&format!("{name}/model.ply"))
+    /// The standard output of that training.
+    pub(crate) fn trained(&self, name: &str, options: &str) -> String {
+        self.succeed(&self.train(name, options))
     }
 }
 

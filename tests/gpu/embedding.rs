@@ -6,11 +6,9 @@ use std::ffi::CStr;
 
 use ash::vk::Handle as _;
 use ash::{ext, khr, vk};
-use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{Gpu, HostDevice, HostFrame};
-use nightsplat::splats::render::{RenderSettings, Renderer};
-use nightsplat_photographs::image::Image;
+use nightsplat::gpu::{HostDevice, HostFrame};
 
+use crate::common::prelude::*;
 use crate::host::{Host, Memory};
 use crate::images::{OPTIONS, cameras, gaussians};
 

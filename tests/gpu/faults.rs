@@ -1,19 +1,15 @@
 //! Memory that runs out and devices that are lost, at every possible place: saved work is not lost, and no run claims
 //! to be finished unless it is.
 
-use std::collections::BTreeMap;
-use std::path::Path;
-
-use glam::UVec2;
 use nightsplat::Error;
+use nightsplat::gpu::DeviceChoice;
 use nightsplat::gpu::testing::faults;
-use nightsplat::gpu::{DeviceChoice, Gpu};
 use nightsplat::networks::Denoiser;
 use nightsplat::results::run::{self, Event, IfExists, RunSummary};
 use nightsplat::splats::densify::DensityControl;
-use nightsplat::train::{MemoryEstimate, ModelConfig, Part, TrainConfig};
-use nightsplat_photographs::dataset::Dataset;
+use nightsplat::train::{MemoryEstimate, ModelConfig, Part};
 
+use crate::common::prelude::*;
 use crate::common::train::dataset;
 
 fn gpu() -> Gpu {
@@ -67,7 +63,7 @@ fn a_lack_of_memory_anywhere_leaves_a_checkpoint_and_no_finished_run() {
     faults(&gpu).fail_allocation(0);
     assert!(train(&gpu, &config, &dataset, &straight, IfExists::Refuse).0.is_none());
     let names = faults(&gpu).allocations();
-    let expected = std::fs::read(straight.join("model.ply")).unwrap();
+    let expected = fs::read(straight.join("model.ply")).unwrap();
     // The first and the last of every name.
     let mut sites = BTreeMap::<&str, [usize; 2]>::new();
     for (index, name) in names.iter().enumerate() {
@@ -103,7 +99,7 @@ fn a_lack_of_memory_anywhere_leaves_a_checkpoint_and_no_finished_run() {
         if is_saved {
             let (again, _) = train(&gpu, &config, &dataset, &out, IfExists::Resume);
             assert!(again.is_none(), "{name} ({index}), {error}: {again:?}");
-            let model = std::fs::read(out.join("model.ply")).unwrap();
+            let model = fs::read(out.join("model.ply")).unwrap();
             assert!(model == expected, "{name} ({index}), {error}: another model");
             resumed += 1;
         }
@@ -117,7 +113,7 @@ fn a_device_lost_anywhere_leaves_the_last_checkpoint_to_resume_from() {
     let folder = tempfile::tempdir().unwrap();
     let straight = folder.path().join("straight");
     assert!(train(&gpu(), &config, &dataset, &straight, IfExists::Refuse).0.is_none());
-    let expected = std::fs::read(straight.join("model.ply")).unwrap();
+    let expected = fs::read(straight.join("model.ply")).unwrap();
     let mut resumed = 0;
     for number in [1, 40, 80, 95, 105, 115, 125] {
         let out = folder.path().join(format!("run{number}"));
@@ -132,7 +128,7 @@ fn a_device_lost_anywhere_leaves_the_last_checkpoint_to_resume_from() {
         if out.join("config.toml").exists() {
             let (error, _) = train(&gpu(), &config, &dataset, &out, IfExists::Resume);
             assert!(error.is_none(), "{number}: {error:?}");
-            assert!(std::fs::read(out.join("model.ply")).unwrap() == expected, "{number}");
+            assert!(fs::read(out.join("model.ply")).unwrap() == expected, "{number}");
             resumed += 1;
         }
     }

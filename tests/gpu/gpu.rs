@@ -1,13 +1,11 @@
 //! The device layer: choosing a device, buffers at their limits, and all ways to launch work.
 
-use std::time::Duration;
-
-use glam::UVec2;
 use nightsplat::Error;
-use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_with, misuse, not_run};
-use nightsplat::gpu::{Buffer, DeviceChoice, Gpu, Pipeline, Recorder, Threads, devices};
+use nightsplat::gpu::testing::{gpu_that_binds, misuse, not_run};
+use nightsplat::gpu::{Buffer, DeviceChoice, Pipeline, Recorder, devices};
 use nightsplat::kernels::{blend_forward, relu_backward};
-use nightsplat::splats::render::{RenderSettings, Renderer};
+
+use crate::common::prelude::*;
 
 /// Threads of a workgroup of `relu_backward`.
 const WORKGROUP: usize = 256;
@@ -85,7 +83,7 @@ fn a_validation_message_fails_the_process_and_names_the_test() {
     if std::env::var_os("MISUSE_THE_DEVICE").is_some() {
         return misuse(&gpu());
     }
-    let mut child = std::process::Command::new(std::env::current_exe().unwrap());
+    let mut child = Command::new(std::env::current_exe().unwrap());
     let child = child.args(["--exact", NAME, "--test-threads=2"]).env("MISUSE_THE_DEVICE", "1");
     let output = child.output().unwrap();
     let [stdout, stderr] =

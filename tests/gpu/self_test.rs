@@ -1,12 +1,13 @@
 //! The self-test of a device: a sound one passes, and each kind of defect is named.
 
 use nightsplat::Error;
-use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::{faults, gpu, gpu_with};
+use nightsplat::gpu::testing::faults;
 use nightsplat::kernels::self_test::{
     CHECK_BALLOT, CHECK_EXP, CHECK_HALF, CHECK_LANE, CHECK_LAST, CHECK_LOG, CHECK_SHUFFLE,
     CHECK_SIZE, CHECK_SQRT, CHECK_SUBGROUP, CHECK_SUM, CHECK_WORD, CHECKS,
 };
+
+use crate::common::prelude::*;
 
 fn refusal(gpu: &Gpu) -> String {
     let refused = gpu.self_test().unwrap_err();

@@ -1,8 +1,7 @@
 //! The kernels as drivers get them: without specialization constants, valid, and within what is required of a device.
 
-use std::collections::BTreeMap;
 use std::io::Write as _;
-use std::process::{Command, Output, Stdio};
+use std::process::Output;
 
 use nightsplat::gpu::testing::frozen;
 use nightsplat::gpu::{Interface, Kernel as _, REQUIREMENTS};
@@ -10,6 +9,7 @@ use nightsplat::kernels::splat::MAX_CHANNELS;
 use nightsplat::kernels::{ALL, blend_backward, blend_forward};
 
 use crate::common::not_run;
+use crate::common::prelude::*;
 
 // Opcodes and enumerants of the SPIR-V specification.
 const OP_EXECUTION_MODE: u32 = 16;

@@ -1,9 +1,6 @@
 //! The denoising terms.
 
-use glam::UVec2;
 use nightsplat::Result;
-use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::denoising;
 use nightsplat::loss::{DenoisingLoss, LossInputs, LossRegion, Term, Weights};
 
@@ -11,6 +8,7 @@ use super::{
     Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,
     log_step, noise, widen,
 };
+use crate::common::prelude::*;
 
 /// Of the mean squared difference and the total variation.
 const WEIGHTS: [f64; 2] = [0.7, 1.3];

@@ -1,17 +1,13 @@
 //! Trainings on photographs of different exposure.
 
-use std::path::Path;
-
-use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::exposure::BIAS_SCALE;
 use nightsplat::loss::exposure::{Affine, table};
 use nightsplat::results::run::{self, IfExists};
-use nightsplat::train::{Part, TrainConfig, Trainer};
-use nightsplat_photographs::dataset::{Dataset, Split, View};
-use nightsplat_photographs::image::{linear_from_srgb, srgb_from_linear};
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::train::Part;
+use nightsplat_photographs::dataset::View;
+use nightsplat_photographs::image::srgb_from_linear;
 
-use crate::common::train::{advance, small_set};
+use crate::common::prelude::*;
 
 /// The factors of the views' light, in groups of four.
 const FACTORS: [f32; 4] = [1.0, 0.5, 0.25, 2.0];
@@ -90,8 +86,8 @@ fn exposures_that_are_off_leave_no_kernel_and_no_file() {
         assert_eq!(passes, if learn { 4 } else { 0 });
         run::train(&gpu, &config, &dataset, &out, IfExists::Replace, |_| {}).unwrap();
         let exposures = run::load_exposures(&out).unwrap();
-        let metrics = std::fs::read_to_string(out.join("metrics.json")).unwrap();
-        let metrics: serde_json::Value = serde_json::from_str(&metrics).unwrap();
+        let metrics = fs::read_to_string(out.join("metrics.json")).unwrap();
+        let metrics: Value = serde_json::from_str(&metrics).unwrap();
         if learn {
             let learned = trainer.exposures().unwrap().unwrap();
             assert_eq!(exposures.len(), learned.len());
@@ -118,7 +114,7 @@ fn a_run_with_exposures_is_resumed_bit_for_bit() {
     let state = |trainer: &mut Trainer, name: &str| {
         let path = folder.path().join(name);
         trainer.save_checkpoint(&path).unwrap();
-        std::fs::read(path).unwrap()
+        fs::read(path).unwrap()
     };
     let mut whole = new();
     advance(&mut whole, 30);
@@ -168,7 +164,7 @@ fn without_a_table_exposures_start_at_those_of_the_shared_points() {
     let planted = folder.path().join("planted.csv");
     let lines = dataset.train_views().zip(FACTORS.iter().cycle());
     let line = |(view, factor): (&View, &f32)| format!("{},{}\n", view.name, factor.log2());
-    std::fs::write(&planted, format!("name,ev\n{}", lines.map(line).collect::<String>())).unwrap();
+    fs::write(&planted, format!("name,ev\n{}", lines.map(line).collect::<String>())).unwrap();
     config.exposure.start = Some(planted);
     for (found, planted) in found.iter().zip(begin(&config)) {
         let error = found.stops() - planted.stops();
@@ -213,12 +209,12 @@ fn a_table_sets_the_initial_exposures() {
     // Stops of the photographs: with one curve, the targets differ accordingly.
     let lines = names.iter().zip(FACTORS.iter().cycle());
     let lines: String = lines.map(|(name, factor)| format!("{name},{}\n", factor.log2())).collect();
-    std::fs::write(&path, format!("name,ev\n{lines}")).unwrap();
+    fs::write(&path, format!("name,ev\n{lines}")).unwrap();
     config.exposure.start = Some(path.clone());
     let of_stops = begin(&config);
     assert!(of_stops[2].stops() < of_stops[1].stops() && of_stops[1].stops() < of_stops[0].stops());
     // Next to the photographs, it is found.
-    std::fs::copy(&path, folder.path().join("exposures.csv")).unwrap();
+    fs::copy(&path, folder.path().join("exposures.csv")).unwrap();
     config.exposure.start = None;
     assert_eq!(begin(&config), of_stops);
 
@@ -234,7 +230,7 @@ fn a_table_sets_the_initial_exposures() {
         assert!((0..3).all(|c| gap(c) < 4e-6), "{again} is not {first}");
     }
 
-    std::fs::write(&path, "name,ev\nnoone,1\nelsewhere,2\n").unwrap();
+    fs::write(&path, "name,ev\nnoone,1\nelsewhere,2\n").unwrap();
     let error = Trainer::new(&gpu(), config, &dataset).unwrap_err().to_string();
     assert!(error.contains("noone, elsewhere") && error.contains("known.csv"), "{error}");
 }

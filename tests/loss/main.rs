@@ -17,15 +17,13 @@ mod exposed_training;
 mod masks;
 mod view_exposures;
 
-use std::collections::BTreeMap;
-
 use common::{largest, widen};
-use glam::UVec2;
 use nightsplat::Result;
-use nightsplat::gpu::{Buffer, Gpu, Recorder};
+use nightsplat::gpu::{Buffer, Recorder};
 use nightsplat::kernels::status::{STATUS_NOT_FINITE as NOT_FINITE, STATUS_WORDS};
 use nightsplat::loss::{LogSlot, LossLog, StepLosses, Term, TermInputs};
-use nightsplat::splats::scene::Features;
+
+use crate::common::prelude::*;
 
 /// The terms of one step in the log.
 struct Logged {
@@ -73,7 +71,7 @@ fn bits(values: &[f32]) -> Vec<u32> {
 
 /// Reproducible values between `low` and `high`.
 fn noise(seed: u64, count: usize, low: f64, high: f64) -> Vec<f32> {
-    let mut random = common::Random::new(seed);
+    let mut random = Random::new(seed);
     (0..count).map(|_| random.between(low, high) as f32).collect()
 }
 

@@ -1,14 +1,11 @@
 //! Masked pixels do not affect statistics, losses, gradients, density control or scores.
 
-use nightsplat::gpu::testing::gpu;
-use nightsplat::networks::{DenoiserSettings, NetworkVariant};
-use nightsplat::train::{Part, TrainConfig, Trainer};
-use nightsplat_photographs::dataset::Dataset;
-use nightsplat_photographs::image::{Image, Mask};
-use nightsplat_photographs::metrics::{Scores, psnr_of_counted};
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::train::Part;
+use nightsplat_photographs::image::Mask;
+use nightsplat_photographs::metrics::psnr_of_counted;
 
-use crate::common::train::{advance, train};
+use crate::common::prelude::*;
+use crate::common::train::train;
 
 /// The right third of every view is masked, and a column at its border by half.
 fn masked(mut dataset: Dataset, hidden: Option<[f32; 3]>) -> Dataset {

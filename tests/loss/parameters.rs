@@ -1,17 +1,15 @@
 //! The terms on parameters.
 
-use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{Buffer, Threads};
+use nightsplat::gpu::Buffer;
 use nightsplat::kernels::parameter_terms;
 use nightsplat::loss::{ParameterTerms, ParameterWeights, Term};
 use nightsplat::reference::parameter_terms::parameter_terms;
 use nightsplat::splats::attributes::{Attribute, PlaneCounts, column_count};
 use nightsplat::splats::batches::Batches;
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::scene::{GaussianSlice, Layout};
-use nightsplat_core::random::Stream;
+use nightsplat::splats::scene::GaussianSlice;
 
 use super::{assert_close, central_differences, log_step};
+use crate::common::prelude::*;
 
 /// Planes of Gaussians of SH degree 0 without features.
 fn planes(count: usize) -> Vec<f32> {

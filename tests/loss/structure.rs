@@ -1,17 +1,14 @@
 //! The structure of a pseudo-GT, and the term that compares a plane of the render with it.
 
-use glam::UVec2;
-use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::structure_l1;
 use nightsplat::loss::{LossTerm as _, StructureLoss, Term};
-use nightsplat::splats::scene::Features;
 use nightsplat::targets::structure::StructureTarget;
 
 use super::{
     Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,
     log_step, noise, term_inputs, widen,
 };
+use crate::common::prelude::*;
 
 const FEATURES: Features = Features { structure: true, ..Features::NONE };
 

@@ -1,17 +1,13 @@
 //! Exposures: kernels against their references, gradients against central differences, and the mean that stays the
 //! identity.
 
-use glam::{UVec2, Vec2};
-use nightsplat::gpu::Threads;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use nightsplat::kernels::{expose, expose_backward, exposure_center, exposure_gradient};
 use nightsplat::loss::exposure::{Affine, ExposureRates, Exposures};
 use nightsplat::splats::optimizer::{Adam, Learnable};
 
-use crate::common::Random;
 use crate::common::chain::Chain;
-use crate::common::setup::Setup;
+use crate::common::prelude::*;
 
 const WIDTH: usize = EXPOSURE_WIDTH as usize;
 

@@ -1,17 +1,16 @@
 //! Crops of a view: their positions, and copying them.
 
-use glam::UVec2;
 use nightsplat::gpu::Reference;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::{crop_gather, crop_scatter};
 use nightsplat::networks::crop::{CropKernels, PaddedCrop};
-use nightsplat_core::random::Stream;
+
+use crate::common::prelude::*;
 
 #[test]
 fn a_crop_is_a_cell_of_the_view_and_its_margin_is_clipped_to_the_view() {
     let stream = Stream::new(1, 2);
     let view = UVec2::new(43, 25);
-    let mut cells = std::collections::BTreeSet::new();
+    let mut cells = BTreeSet::new();
     for draw in 0..500 {
         let crop = PaddedCrop::random(view, 20, 6, &stream, draw);
         let corner = crop.origin + crop.crop_origin;

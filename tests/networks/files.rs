@@ -1,12 +1,9 @@
 //! Network files: saved ones are read back, and unsuitable ones refused with a remedy.
 
-use std::path::Path;
-
-use nightsplat::gpu::testing::gpu;
-use nightsplat::networks::{
-    Denoiser, DenoiserSettings, NetworkVariant, Precision, Tonemapper, load, save,
-};
+use nightsplat::networks::{Denoiser, Precision, Tonemapper, load, save};
 use safetensors::SafeTensors;
+
+use crate::common::prelude::*;
 
 const SMALL: DenoiserSettings = DenoiserSettings {
     stages: 2,
@@ -52,9 +49,9 @@ fn saved_networks_are_read_back() {
     load_both(&path, &mut loaded).unwrap();
     assert_eq!(values(&saved), values(&loaded));
 
-    let bytes = std::fs::read(&path).unwrap();
+    let bytes = fs::read(&path).unwrap();
     save_both(&path, &loaded);
-    assert_eq!(bytes, std::fs::read(&path).unwrap(), "the same networks make the same file");
+    assert_eq!(bytes, fs::read(&path).unwrap(), "the same networks make the same file");
     let file = SafeTensors::deserialize(&bytes).unwrap();
     assert_eq!(file.tensor("denoiser.1.conv_out.weight").unwrap().shape(), [3, 4, 3, 3]);
     assert_eq!(file.tensor("tonemapper.conv1.bias").unwrap().shape(), [16]);
@@ -62,7 +59,7 @@ fn saved_networks_are_read_back() {
     let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
     let settings = &header.metadata().as_ref().unwrap()["networks"];
     assert!(settings.contains(r#""denoiser":{"stages":2,"repeats":1,"channels":4,"#), "{settings}");
-    let left: Vec<_> = std::fs::read_dir(folder.path()).unwrap().collect();
+    let left: Vec<_> = fs::read_dir(folder.path()).unwrap().collect();
     assert_eq!(left.len(), 1, "no partial file remains");
 }
 
@@ -106,15 +103,15 @@ fn damaged_files_are_detected() {
     };
     refused(&mut all, "cannot be read");
     save_both(&path, &all);
-    let whole = std::fs::read(&path).unwrap();
+    let whole = fs::read(&path).unwrap();
     for cut in [0, 7, 100, whole.len() - 4] {
-        std::fs::write(&path, &whole[..cut]).unwrap();
+        fs::write(&path, &whole[..cut]).unwrap();
         refused(&mut all, "not an intact safetensors file");
     }
     let mut poisoned = whole;
     let last = poisoned.len() - 4;
     poisoned[last..].copy_from_slice(&f32::NAN.to_le_bytes());
-    std::fs::write(&path, &poisoned).unwrap();
+    fs::write(&path, &poisoned).unwrap();
     refused(&mut all, "not finite");
     let nowhere = folder.path().join("missing/networks.safetensors");
     let error = save(&nowhere, &[all.0.parameters()], &gpu()).unwrap_err();

@@ -1,9 +1,7 @@
 //! The networks' gradients in double precision against central differences.
 
-use nightsplat::networks::{DenoiserSettings, NetworkVariant};
-
 use super::model::{Denoiser, Gradients, Tonemapper};
-use crate::common::Random;
+use crate::common::prelude::*;
 
 /// Compares the central difference of `loss` in every element of `at` with `gradient`, relative to its largest.
 fn check(what: &str, at: &[f64], gradient: &[f64], loss: &dyn Fn(&[f64]) -> f64) {

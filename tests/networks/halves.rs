@@ -1,13 +1,12 @@
 //! The kernels of 16-bit matrices: packing and products, against their references and single precision.
 
-use glam::UVec2;
-use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{CooperativeMatrix, Threads};
+use nightsplat::gpu::CooperativeMatrix;
 use nightsplat::kernels::packed::{PACKED_CHANNELS, PACKED_COLUMNS, PACKED_ROWS};
 use nightsplat::kernels::*;
 
 use super::kernels::{SIZES, values};
-use crate::common::{Random, assert_close, not_run};
+use crate::common::not_run;
+use crate::common::prelude::*;
 
 /// The matrices of the device; without them the test does not run.
 fn matrix() -> Option<CooperativeMatrix> {

@@ -1,11 +1,8 @@
 //! Every kernel against its reference, at sizes and channel counts that divide no block size.
 
-use glam::{UVec2, Vec2};
-use nightsplat::gpu::Threads;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::*;
 
-use crate::common::Random;
+use crate::common::prelude::*;
 
 pub(crate) const SIZES: [[u32; 2]; 5] = [[1, 1], [3, 1], [5, 7], [8, 8], [33, 17]];
 

@@ -1,17 +1,12 @@
 //! LPIPS against `PyTorch`, with weights from the same formula: `scripts/lpips-reference.py` prints the expected
 //! values.
 
-use std::process::Command;
-
-use glam::UVec2;
-use nightsplat::gpu::Threads;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::*;
 use nightsplat::networks::lpips::{Lpips, LpipsVersion, Network, Range};
-use nightsplat_photographs::image::Image;
 
 use crate::common::lpips::{noise, write};
-use crate::common::{Random, not_run, safetensors};
+use crate::common::prelude::*;
+use crate::common::{not_run, safetensors};
 
 fn picture(width: u32, height: u32, salt: u64) -> Image {
     let value = |at: usize| {
@@ -106,7 +101,7 @@ fn weights_of_another_network_are_named() {
         assert!(!message.contains('\n') && message.contains("lpips.safetensors"), "{message}");
     };
     refused(&["cannot be read"]);
-    std::fs::write(&path, "no weights").unwrap();
+    fs::write(&path, "no weights").unwrap();
     refused(&["not an intact safetensors file"]);
     write(Network::Alex, &path, |name, shape, values| {
         if name == "net.slice1.0.weight" {

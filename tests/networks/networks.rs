@@ -1,15 +1,11 @@
 //! The networks on the device: against references in double precision, and their rules of use.
 
-use glam::UVec2;
-use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{CheckReport, DeviceChoice, Gpu};
-use nightsplat::networks::{
-    Denoiser, DenoiserSettings, NetworkVariant, Parameters, Precision, Tonemapper,
-};
+use nightsplat::gpu::{CheckReport, DeviceChoice};
+use nightsplat::networks::{Denoiser, Parameters, Precision, Tonemapper};
 
 use super::model;
 use super::{largest, narrow, widen};
-use crate::common::{Random, assert_close};
+use crate::common::prelude::*;
 
 /// The results of a network for two images and a gradient: output, gradients of parameters and of both inputs.
 #[derive(PartialEq)]

@@ -1,15 +1,11 @@
 //! The networks against `PyTorch`: `tests/fixtures/torch/README.md` describes each tensor and its origin.
 
-use std::path::Path;
-
-use glam::UVec2;
-use nightsplat::gpu::testing::gpu;
-use nightsplat::networks::{Denoiser, DenoiserSettings, NetworkVariant, Parameters, Tonemapper};
+use nightsplat::networks::{Denoiser, Parameters, Tonemapper};
 use safetensors::SafeTensors;
 
 use super::largest;
 use super::networks::{Outcome, assert_gradients, run_denoiser, run_tonemapper};
-use crate::common::assert_close;
+use crate::common::prelude::*;
 
 const SIZE: UVec2 = UVec2::new(9, 7);
 
@@ -23,7 +19,7 @@ impl Fixture {
     fn new(network: &'static str) -> Self {
         let path = Path::new(env!("CARGO_MANIFEST_DIR"));
         let path = path.join("tests/fixtures/torch/networks.safetensors");
-        Self { bytes: std::fs::read(path).unwrap(), network }
+        Self { bytes: fs::read(path).unwrap(), network }
     }
 
     fn get(&self, name: &str) -> Vec<f32> {

@@ -1,16 +1,15 @@
 //! Curves from files: TOML settings, CSV and .cube tables, and errors in them.
 
-use std::path::PathBuf;
-
 use nightsplat::Error;
-use nightsplat::train::TrainConfig;
-use nightsplat_photographs::tone::{CurveChoice, Family, Table, Tone, ToneCurve, ToneSettings};
+use nightsplat_photographs::tone::{CurveChoice, Family, Table, Tone};
+
+use crate::common::prelude::*;
 
 /// A curve read from a file with this name and text.
 fn load(name: &str, text: &str) -> Result<ToneSettings, Error> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(name);
-    std::fs::write(&path, text).unwrap();
+    fs::write(&path, text).unwrap();
     path.to_str().unwrap().parse::<CurveChoice>().unwrap().settings()
 }
 

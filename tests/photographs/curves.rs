@@ -1,13 +1,12 @@
 //! The table of curves: published values, the claimed properties of each row, and the device against the host.
 
-use nightsplat::gpu::Threads;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::curves::{
     CURVE_ASE, CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_PROFILE, CURVE_TABLE,
 };
 use nightsplat::kernels::{ToneParameters, pseudo_gt};
-use nightsplat::targets::pseudo_gt::PseudoGt;
-use nightsplat_photographs::tone::{FAMILIES, Family, Table, ToneCurve, ToneSettings, White};
+use nightsplat_photographs::tone::{FAMILIES, Family, Table, White};
+
+use crate::common::prelude::*;
 
 /// The published values after the clamp, as printed.
 const T: [f64; 8] = [0.05, 0.10, 0.25, 0.50, 1.00, 1.50, 2.00, 3.00];
@@ -63,7 +62,7 @@ fn every_family_has_the_published_values_to_their_last_digit() {
 
 #[test]
 fn the_table_is_in_order_and_its_names_are_unique() {
-    let mut names = std::collections::BTreeSet::new();
+    let mut names = BTreeSet::new();
     for (number, family) in FAMILIES.iter().enumerate() {
         assert_eq!(family.curve as usize, number, "{}", family.name);
         for name in std::iter::once(&family.name).chain(family.aliases) {

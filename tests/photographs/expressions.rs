@@ -2,16 +2,12 @@
 
 use std::f64::consts::PI;
 
-use nightsplat::targets::pseudo_gt::PseudoGt;
-use nightsplat::train::TrainConfig;
 use nightsplat_fit::{FitOptions, Pair, fit};
-use nightsplat_photographs::image::Image;
 use nightsplat_photographs::scene_tone::SceneTone;
-use nightsplat_photographs::tone::{
-    CurveChoice, InverseTone, MeasuredPhotograph, Statistics, Tone, ToneSettings,
-};
+use nightsplat_photographs::tone::{CurveChoice, InverseTone, MeasuredPhotograph, Tone};
 
-use nightsplat::gpu::testing::gpu;
+use crate::common::command::says;
+use crate::common::prelude::*;
 
 fn settings(text: &str) -> ToneSettings {
     text.parse::<CurveChoice>().unwrap().settings().unwrap_or_else(|error| panic!("{error}"))
@@ -87,9 +83,7 @@ fn a_configuration_keeps_formula_constants_and_bounds() {
     let mine = settings("a*t/(t+b); a = 0.9; b = 0.3 in 0.01..5");
     let config = TrainConfig { tone: mine.clone(), ..TrainConfig::bare() };
     let text = config.to_toml().unwrap();
-    for part in ["curve = \"a*t/(t+b)\"", "a = 0.9", "b = [0.01, 5.0]", "b = 0.3"] {
-        assert!(text.contains(part), "no {part} in {text}");
-    }
+    says(&text, &["curve = \"a*t/(t+b)\"", "a = 0.9", "b = [0.01, 5.0]", "b = 0.3"]);
     let read: TrainConfig = toml::from_str(&text).unwrap();
     assert_eq!(read.tone, mine);
     assert_eq!(read.to_toml().unwrap(), text);

@@ -5,12 +5,12 @@ mod command;
 mod profile;
 
 use nightsplat::Error;
-use nightsplat_core::random::Stream;
 use nightsplat_fit::{
     Channels, CurveFit, FitOptions, FitScene, Pair, Weighting, cross_validate, fit, psnr,
 };
-use nightsplat_photographs::image::Image;
-use nightsplat_photographs::tone::{FAMILIES, Family, Statistics, ToneCurve, ToneSettings, White};
+use nightsplat_photographs::tone::{FAMILIES, Family, White};
+
+use crate::common::prelude::*;
 
 /// A dark photograph of independent colours; brightness decreases exponentially, so that t reaches about 4, from a
 /// black level of `floor`.
@@ -426,7 +426,7 @@ fn constants_fitted_to_some_pairs_are_better_than_the_published_ones_on_others()
 /// differ by more than the curves do.
 #[test]
 fn constants_fitted_to_real_pairs_are_better_than_the_published_ones_on_others() {
-    let Some(folder) = crate::common::shared("data/pairs_lol") else { return };
+    let Some(folder) = shared("data/pairs_lol") else { return };
     let scene = FitScene::load(&folder, None).unwrap();
     assert_eq!(scene.pairs.len(), 15);
     let pairs: Vec<&Pair> = scene.pairs.iter().collect();

@@ -3,15 +3,13 @@
 //! The parsers and seeds are those of the fuzz targets; here, seeds are mutated by a fixed stream of random numbers,
 //! the same in every run. `NIGHTSPLAT_ROUNDS` sets the number of rounds; findings of fuzzing are among the seeds.
 
-use std::fs;
 use std::panic::catch_unwind;
-use std::path::Path;
-
-use nightsplat_core::random::Stream;
 
 #[path = "../../fuzz/parsers.rs"]
 mod parsers;
 use parsers::{PARSERS, Parser};
+
+use crate::common::prelude::*;
 
 /// Replacements for numbers and words of text formats.
 const WORDS: [&str; 12] = [

@@ -1,12 +1,9 @@
 //! The synthetic sets whose cameras carry a lamp.
 
-use std::path::Path;
-
-use nightsplat_photographs::dataset::{Dataset, LoadOptions};
-use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb};
-use nightsplat_synth::{Capture, SyntheticOptions};
+use nightsplat_photographs::dataset::LoadOptions;
 
 use crate::common::command::{refused, run};
+use crate::common::prelude::*;
 
 fn set() -> SyntheticOptions {
     let lamp = Some(16.0);
@@ -149,8 +146,7 @@ fn the_command_makes_the_same_set_twice() {
         run(&format!("synth {} {size} {lamp}", folder.path().join(name).display()), 0);
     }
     for file in ["low/001.png", "high/001.png", "lit/000.png", "colmap_sparse/0/points3D.txt"] {
-        let [a, b, c] =
-            ["a", "b", "c"].map(|set| std::fs::read(folder.path().join(set).join(file)));
+        let [a, b, c] = ["a", "b", "c"].map(|set| fs::read(folder.path().join(set).join(file)));
         let [a, b, c] = [a.unwrap(), b.unwrap(), c.unwrap()];
         assert!(a == b && b != c, "{file}");
     }

@@ -1,12 +1,9 @@
 //! The scores agree with independently computed values.
 
-use std::path::Path;
-use std::process::Command;
+use nightsplat_photographs::metrics::{psnr, psnr_channel_mean, ssim, ssim_uniform};
 
-use nightsplat_photographs::image::{Image, ImageFile};
-use nightsplat_photographs::metrics::{Scores, psnr, psnr_channel_mean, ssim, ssim_uniform};
-
-use crate::common::{not_run, shared};
+use crate::common::not_run;
+use crate::common::prelude::*;
 
 fn pattern(width: u32, height: u32) -> (Image, Image) {
     let render = |x: u32, y: u32, c: u32| f64::from((x * 7 + y * 13 + c * 29) % 32) / 31.0;
@@ -91,7 +88,7 @@ fn scores_agree_with_the_scoring_script() {
     let (render, reference) = pattern(60, 40);
     let (renders, references) = (dir.path().join("renders"), dir.path().join("references"));
     for (folder, image) in [(&renders, &render), (&references, &reference)] {
-        std::fs::create_dir(folder).unwrap();
+        fs::create_dir(folder).unwrap();
         image.save_png8(folder.join("a.png")).unwrap();
     }
     let load = |folder: &Path| Image::load(folder.join("a.png")).unwrap();
@@ -102,7 +99,7 @@ fn scores_agree_with_the_scoring_script() {
         .arg("--json")
         .output()
         .unwrap();
-    let theirs: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let theirs: Value = serde_json::from_slice(&output.stdout).unwrap();
     let theirs: Scores = serde_json::from_value(theirs["mean"].clone()).unwrap();
     assert!((ours.psnr - theirs.psnr).abs() < 0.01, "{ours:?} {theirs:?}");
     assert!(

@@ -1,10 +1,10 @@
 //! Night captures of the synthetic scenes: what a scene has at night, and what a camera does wrong there.
 
-use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb};
-use nightsplat_synth::{self, CameraFaults, Capture, DARKENING, Night, SyntheticOptions};
+use nightsplat_synth::{self, CameraFaults, DARKENING, Night};
 
 use crate::common::command::{refused, run};
 use crate::common::fixture;
+use crate::common::prelude::*;
 
 const VIEWS: usize = 9;
 const WIDTH: u32 = 80;
@@ -187,8 +187,8 @@ fn the_command_makes_the_same_night_twice_and_refuses_what_cannot_be() {
         run(&format!("synth {} {options} {more}", at(name)), 0);
     }
     for file in ["low/001.png", "high/001.png", "colmap_sparse/0/points3D.txt"] {
-        let [a, b, c, d] = ["a", "b", "c", "d"]
-            .map(|set| std::fs::read(folder.path().join(set).join(file)).unwrap());
+        let [a, b, c, d] =
+            ["a", "b", "c", "d"].map(|set| fs::read(folder.path().join(set).join(file)).unwrap());
         assert!(a == b && a != c && a != d, "{file}");
     }
     let lights =

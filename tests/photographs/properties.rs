@@ -1,18 +1,14 @@
 //! Properties for arbitrary input: curves, cameras, lenses, sort and scan, and files that are written and read back.
 
-use std::path::Path;
-
-use glam::{DAffine3, DMat2, DQuat, DVec2, DVec3, EulerRot};
-use nightsplat::gpu::testing::gpu;
-use nightsplat::splats::scene::{Gaussians, ply};
+use glam::{DMat2, EulerRot};
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
-use nightsplat::train::TrainConfig;
-use nightsplat_core::camera::{Camera, CameraModel, Distortion, TrainingFrame};
-use nightsplat_photographs::dataset::{Dataset, LoadOptions};
-use nightsplat_photographs::tone::{FAMILIES, Table, ToneSettings};
+use nightsplat_core::camera::{Distortion, TrainingFrame};
+use nightsplat_photographs::dataset::LoadOptions;
+use nightsplat_photographs::tone::{FAMILIES, Table};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 
+use crate::common::prelude::*;
 use crate::formats::synthetic::{self, Model, SIZE};
 
 /// The same cases in every run; a failure prints its input.

@@ -1,15 +1,13 @@
 //! The curve on the device against the host, for whole photographs and in tiles.
 
 use nightsplat::Error;
-use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::{gpu, gpu_that_binds};
+use nightsplat::gpu::testing::gpu_that_binds;
 use nightsplat::kernels::ToneParameters;
-use nightsplat::targets::pseudo_gt::PseudoGt;
-use nightsplat_photographs::image::{Image, ImageFile};
 use nightsplat_photographs::scene_tone::SceneTone;
-use nightsplat_photographs::tone::{MeasuredPhotograph, ToneCurve, ToneMapping, ToneSettings};
+use nightsplat_photographs::tone::{MeasuredPhotograph, ToneMapping};
 
-use crate::common::{assert_close, fixture, shared};
+use crate::common::fixture;
+use crate::common::prelude::*;
 
 #[test]
 fn a_curve_agrees_with_the_host_from_tiny_to_huge_values() {

@@ -1,12 +1,10 @@
 //! The synthetic street: its light falls along it, and a view sees a part of it.
 
-use std::path::Path;
-
-use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
-use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb};
-use nightsplat_synth::{DARKENING, SyntheticOptions};
+use nightsplat_photographs::dataset::LoadOptions;
+use nightsplat_synth::DARKENING;
 
 use crate::common::command::run;
+use crate::common::prelude::*;
 
 /// The plots of the street.
 const PLOTS: u32 = 12;

@@ -1,16 +1,10 @@
 //! The synthetic dataset has its documented layout, loads, and depends only on its options, byte for byte.
 
-use std::collections::BTreeMap;
-use std::path::Path;
-
-use glam::{DVec2, DVec3};
-use nightsplat_core::camera::CameraModel;
-use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
-use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb};
-use nightsplat_synth::{DARKENING, Night, SyntheticOptions};
+use nightsplat_photographs::dataset::LoadOptions;
+use nightsplat_synth::{DARKENING, Night};
 
 use crate::common::command::{refused, run};
-use crate::common::train::small_set;
+use crate::common::prelude::*;
 
 const SMALL: SyntheticOptions = SyntheticOptions {
     views: 10,
@@ -28,13 +22,13 @@ fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
     let mut files = BTreeMap::new();
     let mut folders = vec![root.to_owned()];
     while let Some(folder) = folders.pop() {
-        for entry in std::fs::read_dir(folder).unwrap() {
+        for entry in fs::read_dir(folder).unwrap() {
             let path = entry.unwrap().path();
             if path.is_dir() {
                 folders.push(path);
             } else {
                 let name = path.strip_prefix(root).unwrap().to_string_lossy().replace('\\', "/");
-                files.insert(name, std::fs::read(path).unwrap());
+                files.insert(name, fs::read(path).unwrap());
             }
         }
     }
@@ -72,7 +66,7 @@ fn the_layout_is_that_of_lom() {
     expected.sort();
     assert_eq!(files.keys().cloned().collect::<Vec<_>>(), expected);
 
-    let list = |split: &str| -> serde_json::Value {
+    let list = |split: &str| -> Value {
         serde_json::from_slice(&files[&format!("transforms_{split}.json")]).unwrap()
     };
     let names = |split: &str| -> Vec<String> {
@@ -183,7 +177,7 @@ fn invalid_options_are_refused() {
 #[test]
 fn a_folder_that_cannot_be_created_is_named() {
     let dir = tempfile::tempdir().unwrap();
-    std::fs::write(dir.path().join("taken"), "").unwrap();
+    fs::write(dir.path().join("taken"), "").unwrap();
     let problem =
         nightsplat_synth::write(dir.path().join("taken"), &SMALL).unwrap_err().to_string();
     assert!(problem.contains("taken"), "{problem}");
@@ -202,7 +196,7 @@ fn every_eighth_view_is_a_test_view() {
 #[test]
 fn a_folder_that_is_not_empty_is_kept_unless_overwritten_and_a_missing_one_is_created() {
     let dir = tempfile::tempdir().unwrap();
-    std::fs::write(dir.path().join("letter.txt"), "mine").unwrap();
+    fs::write(dir.path().join("letter.txt"), "mine").unwrap();
     let synth = |dir: &Path| format!("synth {} --views 3 --width 16 --height 16", dir.display());
     refused(&synth(dir.path()), 1, &["is not empty", "--overwrite"]);
     assert_eq!(files(dir.path()).len(), 1);
@@ -224,10 +218,10 @@ fn a_fisheye_dataset_has_one_lens_in_both_listings_and_matching_points() {
     let CameraModel::Fisheye(lens) = camera.model else { panic!() };
     assert!((lens.angle(0.5 / reach).unwrap().to_degrees() - 65.0).abs() < 1e-9);
     assert!(listed.views.iter().all(|view| view.mask.is_none()));
-    let model = std::fs::read_to_string(root.join("colmap_sparse/0/cameras.txt")).unwrap();
+    let model = fs::read_to_string(root.join("colmap_sparse/0/cameras.txt")).unwrap();
     assert!(model.contains("OPENCV_FISHEYE"), "{model}");
-    let points = std::fs::read_to_string(root.join("colmap_sparse/0/points3D.txt")).unwrap();
-    let images = std::fs::read_to_string(root.join("colmap_sparse/0/images.txt")).unwrap();
+    let points = fs::read_to_string(root.join("colmap_sparse/0/points3D.txt")).unwrap();
+    let images = fs::read_to_string(root.join("colmap_sparse/0/images.txt")).unwrap();
     // Observations of the first view, and the positions of their points.
     let seen: Vec<f64> =
         images.lines().nth(3).unwrap().split(' ').map(|n| n.parse().unwrap()).collect();
@@ -254,7 +248,7 @@ fn a_fisheye_set_trains_renders_scores_and_exports() {
     assert!(!message.contains("cropped"), "{message}");
     run(&format!("train {set} --out {undistorted} --steps 1 --undistort"), 0);
     let scores = run(&format!("eval {native} --json"), 0).0;
-    let scores: serde_json::Value = serde_json::from_str(&scores).unwrap();
+    let scores: Value = serde_json::from_str(&scores).unwrap();
     let psnr = scores["mean"]["psnr"].as_f64().unwrap_or_else(|| panic!("{scores}"));
     assert!(psnr > 15.0, "{psnr}");
     let frames = dir.path().join("frames");

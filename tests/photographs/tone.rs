@@ -1,24 +1,21 @@
 //! Tone curves and their statistics, against the paper and by their properties.
 
-use std::path::{Path, PathBuf};
-
 use nightsplat::Error;
-use nightsplat_photographs::image::{Image, ImageFile};
-use nightsplat_photographs::tone::{
-    GainChoice, Statistics, Tone, ToneCurve, ToneParameters, ToneSettings, percentiles,
-};
+use nightsplat_photographs::tone::{GainChoice, Tone, ToneParameters, percentiles};
 
-use crate::common::{fixture, shared};
+use crate::common::command::says;
+use crate::common::fixture;
+use crate::common::prelude::*;
 
 /// The paper's curves and none, which the loss evaluates directly.
 const PAPER: [ToneCurve; 4] = [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::None];
 
 /// The views of a split, by file name.
 fn names(scene: &Path, split: &str) -> Vec<String> {
-    let json = std::fs::read(scene.join(format!("transforms_{split}.json"))).unwrap();
-    let json: serde_json::Value = serde_json::from_slice(&json).unwrap();
+    let json = fs::read(scene.join(format!("transforms_{split}.json"))).unwrap();
+    let json: Value = serde_json::from_slice(&json).unwrap();
     let frames = json["frames"].as_array().unwrap().iter();
-    let path = |frame: &serde_json::Value| PathBuf::from(frame["file_path"].as_str().unwrap());
+    let path = |frame: &Value| PathBuf::from(frame["file_path"].as_str().unwrap());
     frames.map(|frame| path(frame).file_name().unwrap().to_str().unwrap().to_owned()).collect()
 }
 
@@ -140,9 +137,7 @@ fn curves_are_found_by_name_and_an_unknown_name_lists_them() {
     let error = "gama".parse::<Tone>().unwrap_err();
     assert!(matches!(error, Error::Usage(_)));
     let message = error.to_string();
-    for part in ["gama", "linear", "ase", "ap3", "none"] {
-        assert!(message.contains(part), "{message}");
-    }
+    says(&message, &["gama", "linear", "ase", "ap3", "none"]);
 }
 
 #[test]

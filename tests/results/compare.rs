@@ -2,37 +2,34 @@
 
 use std::fs;
 
-use crate::common::command::{refused, run, succeed};
+use crate::common::command::{json, says};
 use crate::common::workspace::Workspace;
 
 #[test]
 fn runs_of_one_dataset_are_compared_and_runs_of_two_are_refused() {
     let workspace = Workspace::new();
     let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&workspace.train("a", "--steps 10"));
-    succeed(&workspace.train("b", "--steps 40"));
+    workspace.trained("a", "--steps 10");
+    workspace.trained("b", "--steps 40");
     let page = path("page.html");
-    let stdout = succeed(&format!("compare {} {} --report {page}", path("a"), path("b")));
-    for part in ["PSNR of a, dB", "b gains", "steps: 10 | 40"] {
-        assert!(stdout.contains(part), "no `{part}` in: {stdout}");
-    }
+    let stdout = workspace.succeed(&format!("compare @a @b --report {page}"));
+    says(&stdout, &["PSNR of a, dB", "b gains", "steps: 10 | 40"]);
     let html = fs::read_to_string(&page).unwrap();
     assert!(html.contains("Comparison of a, b") && html.contains("data:image/png"));
-    let json = succeed(&format!("compare {} {} --json", path("a"), path("b")));
-    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
-    let psnr = |index: usize| json["runs"][index]["mean"]["psnr"].as_f64().unwrap();
+    let compared = json(workspace.succeed("compare @a @b --json"));
+    let psnr = |index: usize| compared["runs"][index]["mean"]["psnr"].as_f64().unwrap();
     for (index, name) in ["a", "b"].into_iter().enumerate() {
-        let scores = succeed(&format!("eval {} --json", path(name)));
-        let scores: serde_json::Value = serde_json::from_str(&scores).unwrap();
+        let scores = workspace.succeed(&format!("eval @{name} --json"));
+        let scores = json(&scores);
         assert!((psnr(index) - scores["mean"]["psnr"].as_f64().unwrap()).abs() < 1e-9, "{name}");
     }
     // Another size, and another dataset.
-    succeed(&workspace.train("half", "--steps 2 --downscale 1.5"));
-    let other = format!("compare {} {} --report {}", path("a"), path("half"), path("no.html"));
-    refused(&other, 2, &["half", "runs of different datasets", "40x30 and 27x20 pixels"]);
+    workspace.trained("half", "--steps 2 --downscale 1.5");
+    let other = "compare @a @half --report @no.html";
+    workspace.refused(other, 2, &["half", "runs of different datasets", "40x30 and 27x20 pixels"]);
     assert!(!workspace.path("no.html").exists());
-    refused(&format!("compare {}", path("a")), 2, &["<RUNS>"]);
-    refused(&format!("compare {} {}", path("a"), path("nowhere")), 3, &["nowhere"]);
+    workspace.refused("compare @a", 2, &["<RUNS>"]);
+    workspace.refused("compare @a @nowhere", 3, &["nowhere"]);
 }
 
 #[test]
@@ -40,8 +37,8 @@ fn excluded_photographs_are_left_out_and_the_others_keep_their_split() {
     let workspace = Workspace::new();
     let set = workspace.path("set").display().to_string();
     let train = |name: &str, options: &str| workspace.train(name, &format!("--steps 1 {options}"));
-    succeed(&train("all", ""));
-    succeed(&train("less", "--exclude 00[12] --exclude low/003.*"));
+    workspace.succeed(&train("all", ""));
+    workspace.succeed(&train("less", "--exclude 00[12] --exclude low/003.*"));
     let names = |run: &str| fs::read_to_string(workspace.path(run).join("views.csv")).unwrap();
     let gone: Vec<String> = names("all")
         .lines()
@@ -49,28 +46,24 @@ fn excluded_photographs_are_left_out_and_the_others_keep_their_split() {
         .map(str::to_owned)
         .collect();
     assert_eq!(gone.len(), 3, "{gone:?}");
-    fs::write(workspace.path("names.txt"), "# blurred\n001.png\n\n").unwrap();
-    succeed(&train("listed", &format!("--exclude-file {}", workspace.path("names.txt").display())));
-    let config = fs::read_to_string(workspace.path("listed/config.toml")).unwrap();
+    workspace.write("names.txt", "# blurred\n001.png\n\n");
+    workspace.succeed(&train("listed", "--exclude-file @names.txt"));
+    let config = workspace.text("listed/config.toml");
     assert!(config.contains("exclude = [\"001.png\"]"), "{config}");
-    refused(&train("no", "--exclude IMG_*"), 3, &[&set, "`IMG_*`"]);
-    refused(&train("no", "--exclude [a"), 2, &["exclude"]);
-    refused(&train("no", "--exclude *"), 3, &["no photograph is left"]);
+    workspace.refused(&train("no", "--exclude IMG_*"), 3, &[&set, "`IMG_*`"]);
+    workspace.refused(&train("no", "--exclude [a"), 2, &["exclude"]);
+    workspace.refused(&train("no", "--exclude *"), 3, &["no photograph is left"]);
 }
 
 #[test]
 fn a_sweep_over_two_datasets_writes_the_table_that_papers_print() {
     let workspace = Workspace::new();
     let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&format!("synth {} --views 9 --width 32 --height 24", path("other")));
-    let sweep = format!(
-        "sweep {} {} --out {} --curves ap3,ase --seeds 1,2 --steps 2 --sh-degree 0",
-        path("set"),
-        path("other"),
-        path("sweep")
-    );
-    let stdout = succeed(&sweep);
-    let table = fs::read_to_string(workspace.path("sweep/scenes.md")).unwrap();
+    workspace.succeed("synth @other --views 9 --width 32 --height 24");
+    let sweep =
+        "sweep @set @other --out @sweep --curves ap3,ase --seeds 1,2 --steps 2 --sh-degree 0";
+    let stdout = workspace.succeed(sweep);
+    let table = workspace.text("sweep/scenes.md");
     assert!(stdout.contains("| PSNR / SSIM | set | other | mean |"), "{stdout}");
     assert_eq!(table.lines().count(), 4, "{table}");
     // The best mean comes first, and is marked; seeds have a deviation.
@@ -81,22 +74,22 @@ fn a_sweep_over_two_datasets_writes_the_table_that_papers_print() {
     let [first, second] = [0, 1].map(|row| number(&means[row]).parse::<f64>().unwrap());
     assert!(first >= second && means[0].starts_with("**"), "{table}");
     assert_eq!(table.matches(" ± ").count(), 8, "{table}");
-    let page = fs::read_to_string(workspace.path("sweep/index.html")).unwrap();
+    let page = workspace.text("sweep/index.html");
     assert!(page.contains("<h1>Sweep sweep</h1>") && page.contains("class=\"best\""), "{page}");
     for scene in ["set", "other"] {
         assert!(page.contains(&format!("<a href=\"{scene}/index.html\">{scene}: ")), "{page}");
     }
-    let of_scene = fs::read_to_string(workspace.path("sweep/set/index.html")).unwrap();
+    let of_scene = workspace.text("sweep/set/index.html");
     assert!(of_scene.contains("<h1>Sweep of set</h1>"), "{of_scene}");
-    let csv = fs::read_to_string(workspace.path("sweep/scenes.csv")).unwrap();
+    let csv = workspace.text("sweep/scenes.csv");
     assert_eq!(csv.lines().count(), 7, "{csv}");
     assert!(
         workspace.path("sweep/set/index.html").exists()
             && workspace.path("sweep/scenes.tex").exists()
     );
     // Repeated, it trains nothing again.
-    let (_, message) = run(&sweep, 0);
+    let (_, message) = workspace.run(sweep, 0);
     assert!(!message.contains("finished"), "{message}");
     let twice = format!("sweep {0} {0} --out {1} --curves ap3", path("set"), path("twice"));
-    refused(&twice, 2, &["two datasets are named set"]);
+    workspace.refused(&twice, 2, &["two datasets are named set"]);
 }

@@ -1,18 +1,15 @@
 //! The same command gives the same bits: under any load, for any submission, inspection and interruption of the steps,
 //! and according to the ledger of this driver.
 
-use std::fs;
-use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 
-use nightsplat::gpu::testing::gpu;
-use nightsplat::splats::scene::Gaussians;
-use nightsplat::train::{Background, TrainConfig, Trainer};
+use nightsplat::train::Background;
 
 use crate::common::command::succeed;
-use crate::common::train::{advance, dataset, small_set};
+use crate::common::prelude::*;
+use crate::common::train::dataset;
 use crate::common::{fixture, not_run};
 
 const REPETITIONS: usize = 25;
@@ -181,7 +178,7 @@ fn every_device_trains_a_tiny_scene_to_the_same_losses_and_score() {
         assert!((actual / expected - 1.0).abs() <= bound, "step {step}: {actual}, not {expected}");
     }
     let text = fs::read_to_string(run.join("metrics.json")).unwrap();
-    let metrics: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let metrics: Value = serde_json::from_str(&text).unwrap();
     let psnr = metrics["mean"]["psnr"].as_f64().unwrap();
     assert!((psnr - 23.844).abs() <= SCORE, "{psnr} dB");
 }

@@ -1,19 +1,10 @@
 //! Edits of a model: what they keep, what they refuse, and that they repeat.
 
-use std::fs;
-
-use glam::{DAffine3, DMat3, DQuat, DVec3, Vec3};
-use nightsplat::gpu::testing::gpu;
 use nightsplat::splats::model::Model;
-use nightsplat::splats::render::{RenderOptions, Renderer};
-use nightsplat::splats::scene::{Gaussians, ply};
-use nightsplat_core::camera::Camera;
-use nightsplat_core::random::Stream;
-use nightsplat_photographs::image::Image;
 
-use crate::common::command::{refused, run, succeed};
+use crate::common::command::{json, says};
 use crate::common::largest;
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 /// A cloud of Gaussians of degree 3 around the origin.
 fn cloud(count: usize, seed: u64) -> Model {
@@ -54,12 +45,11 @@ fn difference(a: &Image, b: &Image) -> f32 {
 #[test]
 fn a_model_turned_there_and_back_renders_the_same_and_turned_it_does_from_a_turned_camera() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
     let model = cloud(400, 3);
     model.save(workspace.path("model.ply")).unwrap();
     let axis = DVec3::new(1.0, 2.0, -0.5);
     let edit = |options: &str, out: &str| {
-        succeed(&format!("edit {} {options} --out {}", path("model.ply"), path(out)));
+        workspace.succeed(&format!("edit @model.ply {options} --out @{out}"));
         Model::load(workspace.path(out)).unwrap()
     };
     let before = render(&model, &camera(DQuat::IDENTITY));
@@ -94,11 +84,10 @@ fn a_model_turned_there_and_back_renders_the_same_and_turned_it_does_from_a_turn
 #[test]
 fn a_crop_keeps_what_is_inside_and_a_merge_puts_both_halves_together() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
     let model = cloud(300, 5);
     model.save(workspace.path("model.ply")).unwrap();
     let crop = |region: &str, out: &str| {
-        succeed(&format!("edit {} --crop {region} --out {}", path("model.ply"), path(out)));
+        workspace.succeed(&format!("edit @model.ply --crop {region} --out @{out}"));
         ply::load(workspace.path(out)).unwrap()
     };
     let left = crop("-2,-2,-2,0,2,2", "left.ply");
@@ -111,28 +100,16 @@ fn a_crop_keeps_what_is_inside_and_a_merge_puts_both_halves_together() {
     let expected: Vec<Vec3> = model.gaussians.means().iter().filter(inside).copied().collect();
     assert_eq!(ball.means(), expected);
 
-    let merge = format!(
-        "edit {} --merge {} --out {}",
-        path("left.ply"),
-        path("right.ply"),
-        path("both.ply")
-    );
-    let stdout = succeed(&merge);
-    assert!(
-        stdout.contains(&format!("{} Gaussians added to {}", right.count, left.count)),
-        "{stdout}"
-    );
+    let merge = "edit @left.ply --merge @right.ply --out @both.ply";
+    let stdout = workspace.succeed(merge);
+    says(&stdout, &[&format!("{} Gaussians added to {}", right.count, left.count)]);
     let both = Model::load(workspace.path("both.ply")).unwrap();
     let [whole, joined] = [&model, &both].map(|model| render(model, &camera(DQuat::IDENTITY)));
     let error = difference(&whole, &joined);
     assert!(error < 1e-5, "{error}");
 
-    let degree = format!(
-        "edit {} --sh-degree 1 --opacity-min 0.5 --out {}",
-        path("model.ply"),
-        path("less.ply")
-    );
-    succeed(&degree);
+    let degree = "edit @model.ply --sh-degree 1 --opacity-min 0.5 --out @less.ply";
+    workspace.succeed(degree);
     let less = ply::load(workspace.path("less.ply")).unwrap();
     assert_eq!(less.shape.sh_degree, 1);
     assert!(less.count < 200 && less.raw_opacities().iter().all(|raw| *raw >= 0.0));
@@ -145,23 +122,19 @@ fn an_edit_list_repeats_an_edit_of_its_model_and_is_refused_for_another() {
     cloud(200, 7).save(workspace.path("a.ply")).unwrap();
     cloud(100, 8).save(workspace.path("b.ply")).unwrap();
     let options = "--crop 0,0,0,1.2 --rotate 1,1,0:37 --scale 0,0,0:0,2,0=3 --move 1,0,0 --merge";
-    let edit = |options: &str, out: &str| succeed(&format!("edit {options} --out {}", path(out)));
-    let first = format!(
-        "{} {options} {} --save-edits {}",
-        path("a.ply"),
-        path("b.ply"),
-        path("edits.json")
-    );
+    let edit =
+        |options: &str, out: &str| workspace.succeed(&format!("edit {options} --out @{out}"));
+    let first = format!("@a.ply {options} @b.ply --save-edits @edits.json");
     edit(&first, "first.ply");
     edit(&first, "again.ply");
-    edit(&format!("{} --edits {}", path("a.ply"), path("edits.json")), "listed.ply");
+    edit("@a.ply --edits @edits.json", "listed.ply");
     assert_eq!(workspace.read("first.ply"), workspace.read("again.ply"));
     assert_eq!(workspace.read("first.ply"), workspace.read("listed.ply"));
-    let text = fs::read_to_string(workspace.path("edits.json")).unwrap();
+    let text = workspace.text("edits.json");
     assert!(text.contains(r#"{"scale":1.5}"#), "{text}");
 
     // The header has the list, and a later edit keeps it.
-    edit(&format!("{} --move 0,1,0", path("first.ply")), "later.ply");
+    edit("@first.ply --move 0,1,0", "later.ply");
     let later = workspace.read("later.ply");
     let header = String::from_utf8_lossy(&later[..2000]);
     let lists: Vec<&str> =
@@ -170,14 +143,14 @@ fn an_edit_list_repeats_an_edit_of_its_model_and_is_refused_for_another() {
     assert!(!header.contains(&path("b.ply")) && lists[0].contains(r#""file":"b.ply""#), "{header}");
 
     let list = path("edits.json");
-    let other = format!("edit {} --edits {list} --out {}", path("b.ply"), path("out.ply"));
-    refused(&other, 3, &["edits.json", "another model", "b.ply is"]);
+    let other = format!("edit @b.ply --edits {list} --out @out.ply");
+    workspace.refused(&other, 3, &["edits.json", "another model", "b.ply is"]);
     // A merged model that changed since.
     cloud(100, 9).save(workspace.path("b.ply")).unwrap();
-    let changed = format!("edit {} --edits {list} --out {}", path("a.ply"), path("out.ply"));
-    refused(&changed, 3, &["b.ply", "as the edit list says"]);
-    fs::write(workspace.path("edits.json"), text.replace("edits\": 1", "edits\": 9")).unwrap();
-    refused(&changed, 3, &["edits.json", "of version 9"]);
+    let changed = format!("edit @a.ply --edits {list} --out @out.ply");
+    workspace.refused(&changed, 3, &["b.ply", "as the edit list says"]);
+    workspace.write("edits.json", text.replace("edits\": 1", "edits\": 9"));
+    workspace.refused(&changed, 3, &["edits.json", "of version 9"]);
     assert!(!workspace.path("out.ply").exists());
 }
 
@@ -200,19 +173,23 @@ fn an_edit_that_leaves_nothing_or_cannot_be_written_says_so_and_writes_nothing()
         (format!("--scale {set}/transforms_train.json --dataset {set}"), 3, "line 2 is not a name"),
         (String::new(), 2, "no operation is given"),
     ] {
-        refused(&format!("edit {model} {options} --out {out}"), code, &[part]);
+        workspace.refused(&format!("edit {model} {options} --out {out}"), code, &[part]);
     }
-    refused(&format!("edit {model} --move 1,0,0 --out {model}"), 1, &["is the model itself"]);
-    refused(&format!("edit {model} --move 1,0,0 --out {out}.txt"), 2, &["name it .ply"]);
+    workspace.refused(
+        &format!("edit {model} --move 1,0,0 --out {model}"),
+        1,
+        &["is the model itself"],
+    );
+    workspace.refused(&format!("edit {model} --move 1,0,0 --out {out}.txt"), 2, &["name it .ply"]);
     let mut broken = workspace.read("a.ply");
     let length = broken.len();
     broken[length - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
-    fs::write(workspace.path("nan.ply"), broken).unwrap();
+    workspace.write("nan.ply", broken);
     let left = fs::read_dir(workspace.path("")).unwrap().count();
     // The set and the two models.
     assert_eq!(left, 3);
     let out = path("new/folder/out.ply");
-    let (_, message) = run(&format!("edit {} --move 1,0,0 --out {out}", path("nan.ply")), 0);
+    let (_, message) = workspace.run(&format!("edit @nan.ply --move 1,0,0 --out {out}"), 0);
     assert!(message.contains("1 of 20 Gaussians have an infinity or NaN"), "{message}");
     assert_eq!(Gaussians::open(out).unwrap().count, 19);
 }
@@ -221,29 +198,28 @@ fn an_edit_that_leaves_nothing_or_cannot_be_written_says_so_and_writes_nothing()
 fn a_table_of_cameras_in_metres_scales_a_model_and_cameras_crop_it_wherever_it_is() {
     let workspace = Workspace::new();
     let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&workspace.train("run", "--steps 10"));
+    workspace.trained("run", "--steps 10");
     let set = path("set");
     // 2.5 metres a unit, in a world of another origin.
-    let listing = fs::read_to_string(workspace.path("set/transforms_train.json")).unwrap();
-    let listing: serde_json::Value = serde_json::from_str(&listing).unwrap();
-    let row = |frame: &serde_json::Value| {
+    let listing = workspace.text("set/transforms_train.json");
+    let listing = json(&listing);
+    let row = |frame: &Value| {
         let at = |row: usize| 2.5 * frame["transform_matrix"][row][3].as_f64().unwrap() + 100.0;
         let name = frame["file_path"].as_str().unwrap().rsplit('/').next().unwrap();
         format!("{name},{},{},{}\n", at(0), at(1), at(2))
     };
     let table: String = listing["frames"].as_array().unwrap().iter().map(row).collect();
-    fs::write(workspace.path("metres.csv"), format!("name,x,y,z\n{table}")).unwrap();
-    let edit = |options: &str, out: &str| {
-        run(&format!("edit {} {options} --out {}", path("run"), path(out)), 0)
-    };
-    let (stdout, _) = edit(&format!("--scale {}", path("metres.csv")), "metres.ply");
+    workspace.write("metres.csv", format!("name,x,y,z\n{table}"));
+    let edit =
+        |options: &str, out: &str| workspace.run(&format!("edit @run {options} --out @{out}"), 0);
+    let (stdout, _) = edit("--scale @metres.csv", "metres.ply");
     let trained = ply::load(workspace.path("run/model.ply")).unwrap();
     let metres = ply::load(workspace.path("metres.ply")).unwrap();
     for (mean, metres) in trained.means().iter().zip(metres.means()) {
         assert!((*mean * 2.5).distance(*metres) < 1e-4, "{stdout}: {mean} {metres}");
     }
     // Distances of the table are those of the dataset, whatever the model was scaled by before.
-    edit(&format!("--scale 7 --scale {}", path("metres.csv")), "again.ply");
+    edit("--scale 7 --scale @metres.csv", "again.ply");
     let again = ply::load(workspace.path("again.ply")).unwrap();
     for (again, metres) in again.means().iter().zip(metres.means()) {
         assert!(again.distance(*metres) < 1e-4, "{again} {metres}");
@@ -261,8 +237,7 @@ fn a_table_of_cameras_in_metres_scales_a_model_and_cameras_crop_it_wherever_it_i
 #[test]
 fn the_gaussians_that_contribute_most_to_the_photographs_are_kept() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&workspace.train("run", "--steps 40"));
+    workspace.trained("run", "--steps 40");
     let trained = ply::load(workspace.path("run/model.ply")).unwrap();
     // As many again: half of them outside all views, half as transparent as 8 bits do not show.
     let mut unseen = trained.clone();
@@ -273,9 +248,9 @@ fn the_gaussians_that_contribute_most_to_the_photographs_are_kept() {
         unseen.raw_opacities_mut()[index] = -7.0;
     }
     ply::save(&unseen, workspace.path("unseen.ply")).unwrap();
-    let merge = format!("edit {} --merge {}", path("run"), path("unseen.ply"));
+    let merge = "edit @run --merge @unseen.ply";
     let stdout =
-        succeed(&format!("{merge} --max-gaussians {} --out {}", trained.count, path("kept.ply")));
+        workspace.succeed(&format!("{merge} --max-gaussians {} --out @kept.ply", trained.count));
     assert!(stdout.contains(&format!("max-gaussians {0}: {0} of", trained.count)), "{stdout}");
     let kept = ply::load(workspace.path("kept.ply")).unwrap();
     // Of the run's own, only those that no view sees may make room.
@@ -288,16 +263,12 @@ fn the_gaussians_that_contribute_most_to_the_photographs_are_kept() {
     );
 
     let most = trained.count * 2 / 3;
-    let edit = format!("edit {} --max-gaussians {most} --out {}", path("run"), path("most.ply"));
-    succeed(&edit);
+    let edit = format!("edit @run --max-gaussians {most} --out @most.ply");
+    workspace.succeed(&edit);
     let first = workspace.read("most.ply");
-    succeed(&edit);
+    workspace.succeed(&edit);
     assert!(first == workspace.read("most.ply"), "the same command gave other bytes");
-    let all = succeed(&format!(
-        "edit {} --max-gaussians {} --out {}",
-        path("run"),
-        trained.count + 5,
-        path("all.ply")
-    ));
+    let all = workspace
+        .succeed(&format!("edit @run --max-gaussians {} --out @all.ply", trained.count + 5));
     assert!(!all.contains("removed"), "{all}");
 }

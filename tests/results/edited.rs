@@ -1,18 +1,8 @@
 //! An edited or exported model is scored as its run is, edits say what they cost, and nothing bright is scored against
 //! dark photographs.
 
-use std::fs;
-
-use glam::Vec3;
-use nightsplat::splats::scene::{Gaussians, ply};
-use serde_json::Value;
-
-use crate::common::command::{refused, run, succeed};
-use crate::common::workspace::Workspace;
-
-fn json(text: &str) -> Value {
-    serde_json::from_str(text).unwrap()
-}
+use crate::common::command::{json, says};
+use crate::common::prelude::*;
 
 fn psnr(scores: &Value) -> f64 {
     scores["mean"]["psnr"].as_f64().unwrap()
@@ -31,26 +21,26 @@ fn a_model_file_has_the_targets_of_its_run_in_every_format() {
     let path = |name: &str| workspace.path(name).display().to_string();
     let (run_folder, set) = (path("run"), path("set"));
     // Other views, another size and another curve than the defaults.
-    succeed(&workspace.train(
+    workspace.trained(
         "run",
         "--steps 40 --downscale 1.25 --test-every 3 --set tone.curve=ase --set tone.theta=0.4",
-    ));
-    let of_run = json(&succeed(&format!("eval {run_folder} --json")));
+    );
+    let of_run = json(workspace.succeed(&format!("eval {run_folder} --json")));
     let clean = path("clean.ply");
-    succeed(&format!("edit {run_folder} --opacity-min 0.0001 --out {clean}"));
+    workspace.succeed(&format!("edit {run_folder} --opacity-min 0.0001 --out {clean}"));
     for (file, most) in [("clean.ply", 1e-3), ("clean.spz", 1.0), ("clean.sog", 1.0)] {
         if !file.ends_with("ply") {
             let format = file.rsplit('.').next().unwrap();
-            succeed(&format!("export {clean} --format {format} --out {} --up none", path(file)));
+            workspace.succeed(&format!("export {clean} --format {format} --out @{file} --up none"));
         }
-        let scores = json(&succeed(&format!("eval {} --dataset {set} --json", path(file))));
+        let scores = json(workspace.succeed(&format!("eval @{file} --dataset {set} --json")));
         assert!((psnr(&scores) - psnr(&of_run)).abs() < most, "{file}: {scores} {of_run}");
         assert_eq!(scores["against"], of_run["against"], "{file}");
         let [views, views_of_run] = [&scores, &of_run]
             .map(|scores| scores["views"].as_object().unwrap().keys().cloned().collect::<Vec<_>>());
         assert_eq!(views, views_of_run, "{file}");
     }
-    let compared = succeed(&format!("compare {run_folder} {clean} --json"));
+    let compared = workspace.succeed(&format!("compare {run_folder} {clean} --json"));
     let compared = json(&compared);
     assert!((psnr(&compared["runs"][0]) - psnr(&compared["runs"][1])).abs() < 1e-3, "{compared}");
     // A file that states nothing is loaded as the run, and scored against its targets.
@@ -58,45 +48,43 @@ fn a_model_file_has_the_targets_of_its_run_in_every_format() {
     bare.dc_mut().iter_mut().for_each(|dc| *dc *= 0.8);
     ply::save(&bare, workspace.path("bare.ply")).unwrap();
     let compared =
-        succeed(&format!("compare {run_folder} {} --dataset {set} --json", path("bare.ply")));
+        workspace.succeed(&format!("compare {run_folder} @bare.ply --dataset {set} --json"));
     assert!(psnr(&json(&compared)["runs"][1]) > 10.0, "{compared}");
     // The page has targets to compare with.
-    succeed(&format!("export {clean} --format html --dataset {set}"));
-    assert!(fs::read_to_string(workspace.path("clean.html")).unwrap().contains("\"target\""));
+    workspace.succeed(&format!("export {clean} --format html --dataset {set}"));
+    assert!(workspace.text("clean.html").contains("\"target\""));
 }
 
 #[test]
 fn a_bright_model_of_unknown_targets_is_not_scored_against_dark_photographs() {
     let workspace = dark();
     let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&workspace.train("run", "--steps 40"));
+    workspace.trained("run", "--steps 40");
     let trained = ply::load(workspace.path("run/model.ply")).unwrap();
     ply::save(&trained, workspace.path("bare.ply")).unwrap();
     let (bare, set) = (path("bare.ply"), path("set"));
     let known = ["bare.ply", "as bright as the photographs", "--photographs"];
-    refused_after_warnings(&format!("eval {bare} --dataset {set}"), &known);
-    refused_after_warnings(&format!("compare {bare} {} --dataset {set}", path("run")), &known);
-    for command in ["eval", &format!("compare {}", path("bare.ply"))] {
-        succeed(&format!("{command} {bare} --dataset {set} --photographs"));
+    refused_after_warnings(&workspace, &format!("eval {bare} --dataset {set}"), &known);
+    refused_after_warnings(&workspace, "compare @bare.ply @run --dataset @set", &known);
+    for command in ["eval", "compare @bare.ply"] {
+        workspace.succeed(&format!("{command} {bare} --dataset {set} --photographs"));
     }
     // A model as dark as the photographs is scored against them.
     let mut night = trained.with_sh_degree(0);
     let color = 0.282_095;
     night.dc_mut().iter_mut().for_each(|dc| *dc = ((*dc * color + 0.5) * 0.1 - 0.5) / color);
     ply::save(&night, workspace.path("night.ply")).unwrap();
-    succeed(&format!("eval {} --dataset {set}", path("night.ply")));
-    fs::write(workspace.path("page.html"), "<!DOCTYPE html>").unwrap();
-    refused(&format!("export {} --format html", path("page.html")), 3, &["is a page, not a model"]);
+    workspace.succeed(&format!("eval @night.ply --dataset {set}"));
+    workspace.write("page.html", "<!DOCTYPE html>");
+    workspace.refused("export @page.html --format html", 3, &["is a page, not a model"]);
 }
 
 /// Exit code 3, with all parts in the error.
-fn refused_after_warnings(command: &str, parts: &[&str]) {
-    let (_, message) = run(command, 3);
+fn refused_after_warnings(workspace: &Workspace, command: &str, parts: &[&str]) {
+    let (_, message) = workspace.run(command, 3);
     let error = message.lines().last().unwrap();
     assert!(error.starts_with("error: "), "{message}");
-    for part in parts {
-        assert!(error.contains(part), "no `{part}` in: {message}");
-    }
+    says(error, parts);
 }
 
 /// The numbers before ` dB before` and ` dB after`.
@@ -112,20 +100,15 @@ fn before_and_after(stdout: &str) -> [f64; 2] {
 fn an_edit_of_a_run_says_what_it_costs_and_warns_of_a_loss() {
     let workspace = dark();
     let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&workspace.train("run", "--steps 60"));
-    let of_run = json(&succeed(&format!("eval {} --json", path("run"))));
-    let edit = |options: &str| {
-        run(&format!("edit {} {options} --out {}", path("run"), path("out.ply")), 0)
-    };
+    workspace.trained("run", "--steps 60");
+    let of_run = json(workspace.succeed("eval @run --json"));
+    let edit = |options: &str| workspace.run(&format!("edit @run {options} --out @out.ply"), 0);
     let (stdout, message) = edit("--rotate y:90 --opacity-min 0.0001");
     let [before, after] = before_and_after(&stdout);
     assert!((before - psnr(&of_run)).abs() < 0.02 && (after - before).abs() < 0.1, "{stdout}");
     assert!(stdout.contains("test views against their pseudo-GT: "), "{stdout}");
     assert!(!message.contains("loses"), "{message}");
-    assert!(
-        stdout.contains(&format!("out.ply --dataset {} --format html", path("set"))),
-        "{stdout}"
-    );
+    says(&stdout, &[&format!("out.ply --dataset {} --format html", path("set"))]);
     // Half of the model.
     let (stdout, message) = edit("--crop -100,-100,-100,0,100,100");
     let [before, after] = before_and_after(&stdout);
@@ -143,15 +126,15 @@ fn an_edit_of_a_run_says_what_it_costs_and_warns_of_a_loss() {
 fn a_crop_to_the_cameras_spares_what_training_views_show() {
     let workspace = dark();
     let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&workspace.train("run", "--steps 200"));
+    workspace.trained("run", "--steps 200");
     // As many again where no camera looks.
     let trained = ply::load(workspace.path("run/model.ply")).unwrap();
     let mut unseen: Gaussians = trained.clone();
     unseen.means_mut().iter_mut().for_each(|mean| *mean += Vec3::new(0.0, 500.0, 0.0));
     ply::save(&unseen, workspace.path("unseen.ply")).unwrap();
-    let crop = format!("edit {} --merge {} --crop cameras", path("run"), path("unseen.ply"));
+    let crop = "edit @run --merge @unseen.ply --crop cameras";
     let list = path("edits.json");
-    let stdout = succeed(&format!("{crop} --out {} --save-edits {list}", path("near.ply")));
+    let stdout = workspace.succeed(&format!("{crop} --out @near.ply --save-edits {list}"));
     let near = ply::load(workspace.path("near.ply")).unwrap();
     // All but some that are large enough to reach into a view.
     let far = near.means().iter().filter(|mean| mean.y >= 250.0).count();
@@ -160,14 +143,13 @@ fn a_crop_to_the_cameras_spares_what_training_views_show() {
     assert!((after - before).abs() < 0.01, "{stdout}");
     assert!(stdout.contains("crop to the sphere at [") && !stdout.contains("00000000"), "{stdout}");
     // The list has numbers, and repeats the edit without the photographs' cameras.
-    let again = format!("edit {} --edits {list} --out {}", path("run"), path("again.ply"));
-    succeed(&again);
+    let again = format!("edit @run --edits {list} --out @again.ply");
+    workspace.succeed(&again);
     assert!(near == ply::load(workspace.path("again.ply")).unwrap());
     // Walls that a crop by numbers takes are what the test views show.
     let sphere = stdout.split_once("sphere at [").unwrap().1.split_once(", and what").unwrap().0;
     let numbers = sphere.replace("] of radius", ",").replace(' ', "");
-    let (by_numbers, _) =
-        run(&format!("edit {} --crop {numbers} --out {}", path("run"), path("ball.ply")), 0);
+    let (by_numbers, _) = workspace.run(&format!("edit @run --crop {numbers} --out @ball.ply"), 0);
     let ball = ply::load(workspace.path("ball.ply")).unwrap();
     assert!(ball.count <= near.count, "{by_numbers}");
 }

@@ -1,18 +1,12 @@
 //! Floaters that were planted before the cameras are found, and a clean model keeps its Gaussians.
 
-use std::collections::BTreeSet;
-use std::fs;
+use glam::DMat4;
 
-use glam::{DMat4, DVec3, Vec3};
-use nightsplat::splats::scene::{Gaussians, ply};
-use nightsplat_core::random::Stream;
-
-use crate::common::command::succeed;
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 /// Gaussians at random places of random views of a listing, before what they show.
 fn floaters(listing: &str, count: usize) -> Gaussians {
-    let listing: serde_json::Value = serde_json::from_str(listing).unwrap();
+    let listing: Value = serde_json::from_str(listing).unwrap();
     let frames = listing["frames"].as_array().unwrap();
     let poses: Vec<DMat4> = frames
         .iter()
@@ -48,11 +42,10 @@ fn floaters(listing: &str, count: usize) -> Gaussians {
 #[test]
 fn planted_floaters_are_removed_and_a_clean_model_keeps_its_gaussians() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&workspace.train("run", "--steps 400"));
+    workspace.trained("run", "--steps 400");
     let clean = ply::load(workspace.path("run/model.ply")).unwrap();
 
-    let stdout = succeed(&format!("edit {} --floaters --out {}", path("run"), path("clean.ply")));
+    let stdout = workspace.succeed("edit @run --floaters --out @clean.ply");
     let kept = ply::load(workspace.path("clean.ply")).unwrap();
     assert!(kept.count * 100 >= clean.count * 99, "{stdout}");
     let psnr = |stdout: &str, after: &str| -> f64 {
@@ -62,17 +55,12 @@ fn planted_floaters_are_removed_and_a_clean_model_keeps_its_gaussians() {
     let psnr_before = psnr(&stdout, " dB before");
 
     // The same run with floaters in its model.
-    let listing = fs::read_to_string(workspace.path("set/transforms_train.json")).unwrap();
+    let listing = workspace.text("set/transforms_train.json");
     let planted = floaters(&listing, 100);
     ply::save(&planted, workspace.path("planted.ply")).unwrap();
-    succeed(&format!(
-        "edit {} --merge {} --out {}",
-        path("run"),
-        path("planted.ply"),
-        path("both.ply")
-    ));
+    workspace.succeed("edit @run --merge @planted.ply --out @both.ply");
     fs::copy(workspace.path("both.ply"), workspace.path("run/model.ply")).unwrap();
-    let stdout = succeed(&format!("edit {} --floaters --out {}", path("run"), path("found.ply")));
+    let stdout = workspace.succeed("edit @run --floaters --out @found.ply");
     let found = ply::load(workspace.path("found.ply")).unwrap();
     let place_of = |mean: &Vec3| mean.to_array().map(f32::to_bits);
     let left: BTreeSet<[u32; 3]> = found.means().iter().map(place_of).collect();
@@ -84,7 +72,7 @@ fn planted_floaters_are_removed_and_a_clean_model_keeps_its_gaussians() {
 
     // Wherever the model is.
     let moved = "--rotate 1,2,3:40 --scale 3 --move 5,0,0 --floaters";
-    let stdout = succeed(&format!("edit {} {moved} --out {}", path("run"), path("moved.ply")));
+    let stdout = workspace.succeed(&format!("edit @run {moved} --out @moved.ply"));
     let moved = ply::load(workspace.path("moved.ply")).unwrap();
     assert!(moved.count.abs_diff(found.count) <= 2, "{stdout}");
 }

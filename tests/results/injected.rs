@@ -1,15 +1,11 @@
 //! Failures around a run: lost devices, full disks, deleted folders. Each has a defined outcome.
 #![cfg(unix)]
 
-use std::fs;
 use std::io::{BufRead, BufReader};
-use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
-
-use nightsplat::gpu::testing::gpu;
+use std::process::Child;
 
 use crate::common::command::{command, refused_with, run, succeed};
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 /// A running command in its own process group, as a shell would start it.
 fn begun(arguments: &str) -> Child {
@@ -38,7 +34,7 @@ fn ended(child: Child) -> (i32, String) {
 fn a_lost_device_and_a_lack_of_memory_exit_with_4_and_the_run_can_be_resumed() {
     let workspace = Workspace::new();
     let options = "--steps 40 --checkpoint-every 10";
-    succeed(&workspace.train("straight", options));
+    workspace.trained("straight", options);
     for (fault, message) in
         [("submission:60", "was lost while"), ("allocation:100", "out of device memory")]
     {
@@ -49,7 +45,7 @@ fn a_lost_device_and_a_lack_of_memory_exit_with_4_and_the_run_can_be_resumed() {
         assert_eq!(output.status.code(), Some(4), "{fault}: {stderr}");
         assert!(stderr.lines().last().is_some_and(|line| line.contains(message)), "{stderr}");
         assert!(!workspace.path(&name).join("done.json").exists());
-        succeed(&workspace.train(&name, &format!("{options} --resume")));
+        workspace.trained(&name, &format!("{options} --resume"));
         assert!(workspace.model(&name) == workspace.model("straight"), "{fault}");
     }
     let nonsense = [("NIGHTSPLAT_FAULT", "flood:1")];
@@ -61,7 +57,7 @@ fn a_full_disk_is_reported_and_existing_files_stay_intact() {
     let workspace = Workspace::new();
     // Runs of other lengths start equally if none converges before its end.
     let options = "--steps 40 --checkpoint-every 10 --set schedule.cooldown_steps=0";
-    succeed(&workspace.train("run", &options.replace("40", "10")));
+    workspace.trained("run", &options.replace("40", "10"));
     let before = workspace.model("run");
     // Limits the size of files, as on a full disk; the checkpoint needs more.
     let program = command("").get_program().to_str().unwrap().to_owned();
@@ -79,8 +75,8 @@ fn a_full_disk_is_reported_and_existing_files_stay_intact() {
     if let Ok(model) = fs::read(workspace.path("run/model.ply")) {
         assert!(model == before, "half a model");
     }
-    succeed(&workspace.train("run", &format!("{options} --resume")));
-    succeed(&workspace.train("straight", options));
+    workspace.trained("run", &format!("{options} --resume"));
+    workspace.trained("straight", options);
     assert!(workspace.model("run") == workspace.model("straight"));
 }
 
@@ -109,7 +105,7 @@ fn a_deleted_run_folder_is_reported_and_a_run_without_its_photographs_is_saved()
 
     // An empty cache: every photograph is on disk, as at the start of the run.
     let options = "--steps 300 --cache 1K --checkpoint-every 0";
-    succeed(&workspace.train("straight", options));
+    workspace.trained("straight", options);
     let mut child = begun(&workspace.train("run", &format!("{options} --progress json")));
     wait_for_start(&mut child);
     fs::rename(workspace.path("set"), workspace.path("elsewhere")).unwrap();
@@ -119,7 +115,7 @@ fn a_deleted_run_folder_is_reported_and_a_run_without_its_photographs_is_saved()
         assert!(code == 3 && stderr.contains("set"), "{code}: {stderr}");
         assert!(workspace.path("run/checkpoint.safetensors").exists(), "{stderr}");
         fs::rename(workspace.path("elsewhere"), workspace.path("set")).unwrap();
-        succeed(&workspace.train("run", &format!("{options} --resume")));
+        workspace.trained("run", &format!("{options} --resume"));
     }
     assert!(workspace.model("run") == workspace.model("straight"));
 }

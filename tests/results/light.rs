@@ -1,31 +1,20 @@
 //! Light out of a run: the photographs' light, linear files, another size, exposures that vary.
 
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::ply;
-use nightsplat_photographs::image::{Image, ImageFile};
-use serde_json::Value;
 
-use crate::common::command::{refused, run, succeed};
-use crate::common::workspace::Workspace;
-
-fn json(arguments: &str) -> Value {
-    serde_json::from_str(&succeed(arguments)).unwrap()
-}
+use crate::common::command::{json, says};
+use crate::common::prelude::*;
 
 /// The arguments for training with the default curve into `run`.
-fn training(workspace: &Workspace, options: &str) -> String {
-    let (set, out) = (workspace.path("set").display().to_string(), workspace.path("run"));
-    format!("train {set} --out {} --sh-degree 1 --plan none {options}", out.display())
+fn training(options: &str) -> String {
+    format!("train @set --out @run --sh-degree 1 --plan none {options}")
 }
 
 #[test]
 fn renders_are_written_and_scored_in_the_light_of_the_photographs() {
     let workspace = Workspace::new();
-    succeed(&training(&workspace, "--steps 60 --set antialiasing.compensation=true"));
-    let at = |name: &str| workspace.path(name).display().to_string();
-    let run_at = at("run");
-
-    let scored = json(&format!("eval {run_at} --photographs --align --json"));
+    workspace.succeed(&training("--steps 60 --set antialiasing.compensation=true"));
+    let scored = json(workspace.succeed("eval @run --photographs --align --json"));
     let dark = &scored["as_photographs"]["mean"];
     // Sixty steps: the light is about right, and so are dark values.
     assert!(dark["psnr"].as_f64().unwrap() > 25.0, "{dark}");
@@ -35,20 +24,17 @@ fn renders_are_written_and_scored_in_the_light_of_the_photographs() {
     assert!(slope > 3.0, "{dark}");
     let aligned = scored["aligned_with_reference"]["mean"]["psnr"].as_f64().unwrap();
     assert!(aligned >= scored["mean"]["psnr"].as_f64().unwrap() - 0.01);
-    let half = json(&format!("eval {run_at} --downscale 1.5 --json"));
+    let half = json(workspace.succeed("eval @run --downscale 1.5 --json"));
     assert_ne!(half["mean"]["psnr"], scored["mean"]["psnr"]);
-    let table = succeed(&format!("eval {run_at} --photographs --align"));
+    let table = workspace.succeed("eval @run --photographs --align");
     let raised = format!("by {slope:.2}: {:.2} dB of PSNR, dark", 20.0 * slope.log10());
-    for column in ["PSNR, aligned", "PSNR, dark", "stops", &raised] {
-        assert!(table.contains(column), "{table}");
-    }
-    refused(&format!("eval {run_at} --downscale 0.5"), 2, &["is 0.5", "at least 1"]);
+    says(&table, &["PSNR, aligned", "PSNR, dark", "stops", &raised]);
+    workspace.refused("eval @run --downscale 0.5", 2, &["is 0.5", "at least 1"]);
 
     let render = |out: &str, options: &str| {
-        let out = at(out);
-        succeed(&format!("render {run_at} --split test --out {out} {options}"));
-        let file = std::fs::read_dir(&out).unwrap().next().unwrap().unwrap().path();
-        (std::fs::read(&file).unwrap(), Image::load(&file).unwrap())
+        workspace.succeed(&format!("render @run --split test --out @{out} {options}"));
+        let file = fs::read_dir(workspace.path(out)).unwrap().next().unwrap().unwrap().path();
+        (fs::read(&file).unwrap(), Image::load(&file).unwrap())
     };
     let mean = |image: &Image| image.data.iter().sum::<f32>() / image.data.len() as f32;
     let (_, target) = render("target", "");
@@ -58,53 +44,52 @@ fn renders_are_written_and_scored_in_the_light_of_the_photographs() {
     assert!((mean(&linear) / mean(&photograph) - 1.0).abs() < 0.3, "one exposure");
     let is_in = |name: &[u8]| bytes.windows(name.len()).any(|window| window == name);
     assert!(is_in(b"nightsplatStops"), "the header states the exposure");
-    let split = format!("render {run_at} --split test --out {}", at("no"));
-    refused(&format!("{split} --as linear"), 2, &["--as linear", "--format exr"]);
-    refused(&format!("{split} --as photograph --layer depth"), 2, &["--layer"]);
+    let split = "render @run --split test --out @no";
+    let as_linear = format!("{split} --as linear");
+    workspace.refused(&as_linear, 2, &["--as linear", "--format exr"]);
+    workspace.refused(&format!("{split} --as photograph --layer depth"), 2, &["--layer"]);
 }
 
 #[test]
 fn a_model_in_linear_light_states_it_and_has_other_colours() {
     let workspace = Workspace::new();
-    succeed(&training(&workspace, "--steps 40 --antialiasing on"));
-    let at = |name: &str| workspace.path(name).display().to_string();
-    let export = |format: &str, out: &str| {
-        format!("export {} --linear --format {format} --out {}", at("run"), at(out))
-    };
-    succeed(&export("ply", "linear.ply"));
+    workspace.succeed(&training("--steps 40 --antialiasing on"));
+    let export =
+        |format: &str, out: &str| format!("export @run --linear --format {format} --out @{out}");
+    workspace.succeed(&export("ply", "linear.ply"));
     let [encoded, linear] =
         ["run/model.ply", "linear.ply"].map(|name| ply::load(workspace.path(name)).unwrap());
     assert_eq!(encoded.means(), linear.means());
     assert_eq!(encoded.raw_opacities(), linear.raw_opacities());
     assert!(encoded.dc() != linear.dc() && linear.dc().iter().all(|dc| dc.is_finite()));
     let header = String::from_utf8_lossy(&workspace.read("linear.ply")[..2000]).into_owned();
-    for fact in ["nightsplat linear ", "nightsplat antialiased true"] {
-        assert!(header.contains(fact), "{header}");
-    }
-    succeed(&export("glb", "linear.glb"));
+    says(&header, &["nightsplat linear ", "nightsplat antialiased true"]);
+    workspace.succeed(&export("glb", "linear.glb"));
     let text = String::from_utf8_lossy(&workspace.read("linear.glb")).into_owned();
     assert!(text.contains("lin_rec709_display"));
-    refused(&export("spz", "linear.spz"), 2, &["--linear needs floats", "ply, glb or usda"]);
-    let of_file = format!("export {} --linear --format glb", at("linear.ply"));
-    refused(&of_file, 2, &["is a model file", "pass the run directory"]);
-    let (_, warned) = run(&format!("export {} --format glb", at("linear.ply")), 0);
+    workspace.refused(
+        &export("spz", "linear.spz"),
+        2,
+        &["--linear needs floats", "ply, glb or usda"],
+    );
+    let of_file = "export @linear.ply --linear --format glb";
+    workspace.refused(of_file, 2, &["is a model file", "pass the run directory"]);
+    let (_, warned) = workspace.run("export @linear.ply --format glb", 0);
     assert!(warned.contains("its colours are linear light, raised by"), "{warned}");
 }
 
 #[test]
 fn a_trained_model_states_the_law_whose_inverse_is_the_linear_light() {
     let workspace = Workspace::new();
-    succeed(&training(&workspace, "--steps 40"));
-    let at = |name: &str| workspace.path(name).display().to_string();
-    let export =
-        |options: &str, out: &str| format!("export {} {options} --out {}", at("run"), at(out));
-    succeed(&export("--format ply --linear", "linear.ply"));
+    workspace.succeed(&training("--steps 40"));
+    let export = |options: &str, out: &str| format!("export @run {options} --out @{out}");
+    workspace.succeed(&export("--format ply --linear", "linear.ply"));
     let header = String::from_utf8_lossy(&workspace.read("linear.ply")[..2000]).into_owned();
     let stated = header.lines().find_map(|line| line.strip_prefix("comment nightsplat linear "));
     let stops: f32 = stated.unwrap().parse().unwrap();
     for format in ["ply", "spz", "sog"] {
         let out = format!("law.{format}");
-        succeed(&export(&format!("--format {format}"), &out));
+        workspace.succeed(&export(&format!("--format {format}"), &out));
     }
     for model in ["run/model.ply", "run", "law.ply", "law.spz", "law.sog"] {
         let law = Model::load(workspace.path(model)).unwrap().law.expect(model);
@@ -112,14 +97,10 @@ fn a_trained_model_states_the_law_whose_inverse_is_the_linear_light() {
     }
     assert_eq!(Model::load(workspace.path("linear.ply")).unwrap().law, None);
     // Colours of another law are not made of these photographs.
-    let other = format!("--out {} --curve ase --steps 40", at("other"));
-    succeed(&format!("train {} --sh-degree 1 --plan none {other}", at("set")));
-    let merge = |file: &str, out: &str| {
-        let [run, file, out] = ["run", file, out].map(at);
-        format!("edit {run} --merge {file} --out {out}")
-    };
-    succeed(&merge("law.ply", "both.ply"));
-    succeed(&merge("other/model.ply", "mixed.ply"));
+    let other = "train @set --out @other --curve ase --steps 40 --sh-degree 1 --plan none";
+    workspace.succeed(other);
+    workspace.succeed("edit @run --merge @law.ply --out @both.ply");
+    workspace.succeed("edit @run --merge @other/model.ply --out @mixed.ply");
     assert!(Model::load(workspace.path("both.ply")).unwrap().law.is_some());
     assert_eq!(Model::load(workspace.path("mixed.ply")).unwrap().law, None);
 }
@@ -127,10 +108,9 @@ fn a_trained_model_states_the_law_whose_inverse_is_the_linear_light() {
 #[test]
 fn a_set_of_varying_exposure_has_its_clean_references_and_the_same_bytes_for_a_seed() {
     let workspace = Workspace::new();
-    let at = |name: &str| workspace.path(name).display().to_string();
     // The set has dark photographs and, in `high`, those in normal light.
     let vary = |out: &str, options: &str| {
-        run(&format!("vary {} --out {} --gamma 0.8,1.25 {options}", at("set"), at(out)), 0).1
+        workspace.run(&format!("vary @set --out @{out} --gamma 0.8,1.25 {options}"), 0).1
     };
     assert!(!vary("a", "--seed 3").contains("are dark"));
     vary("b", "--seed 3");
@@ -143,33 +123,34 @@ fn a_set_of_varying_exposure_has_its_clean_references_and_the_same_bytes_for_a_s
     let [varied, clean] = ["a/low/001.png", "a/images/001.png"]
         .map(|file| Image::load(workspace.path(file)).unwrap());
     assert_ne!(varied.data, clean.data);
-    let out = format!("train {} --out {} --steps 5 --plan none", at("a"), at("run"));
-    succeed(&out);
-    let scored = json(&format!("eval {} --json", at("run")));
+    workspace.succeed("train @a --out @run --steps 5 --plan none");
+    let scored = json(workspace.succeed("eval @run --json"));
     assert!(scored.get("against").is_none(), "scored against the clean photographs: {scored}");
     assert!(scored.get("at_own_exposure").is_none(), "no exposure is known");
     // Told that test view 000 is two stops brighter than the others, the render is, too.
     let known: String =
         (0..9).map(|i| format!("{i:03},{}\n", if i == 0 { 2 } else { 0 })).collect();
-    std::fs::write(workspace.path("a/exposures.csv"), format!("name,ev\n{known}")).unwrap();
-    let told = json(&format!("eval {} --json", at("run")));
+    workspace.write("a/exposures.csv", format!("name,ev\n{known}"));
+    let told = json(workspace.succeed("eval @run --json"));
     let psnr = |scores: &Value, view: &str| scores["views"][view]["psnr"].as_f64().unwrap();
     assert_ne!(psnr(&told["at_own_exposure"], "000"), psnr(&told, "000"));
     assert_eq!(psnr(&told["at_own_exposure"], "008"), psnr(&told, "008"));
-    assert!(succeed(&format!("eval {}", at("run"))).contains("PSNR, own exposure"));
-    let refused_gamma = format!("vary {} --out {} --gamma 2,1", at("set"), at("d"));
-    refused(&refused_gamma, 2, &["a gamma of 2,1", "the lower first"]);
-    refused(&format!("vary {} --out {}", at("set"), at("a")), 1, &["is not empty", "--overwrite"]);
+    says(&workspace.succeed("eval @run"), &["PSNR, own exposure"]);
+    workspace.refuses_all(
+        "
+        2 | vary @set --out @d --gamma 2,1 | a gamma of 2,1 & the lower first
+        1 | vary @set --out @a | is not empty & --overwrite",
+    );
 }
 
 #[test]
 fn varied_exposures_of_a_dark_set_are_warned_of() {
     let workspace = Workspace::new();
-    let (set, out) = (workspace.path("set"), workspace.path("out"));
-    for photograph in std::fs::read_dir(set.join("low")).unwrap() {
+    let set = workspace.path("set");
+    for photograph in fs::read_dir(set.join("low")).unwrap() {
         let photograph = photograph.unwrap();
-        std::fs::copy(photograph.path(), set.join("high").join(photograph.file_name())).unwrap();
+        fs::copy(photograph.path(), set.join("high").join(photograph.file_name())).unwrap();
     }
-    let (_, warned) = run(&format!("vary {} --out {}", set.display(), out.display()), 0);
+    let (_, warned) = workspace.run("vary @set --out @out", 0);
     assert!(warned.contains("photographs are dark"), "{warned}");
 }

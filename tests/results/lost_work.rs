@@ -1,16 +1,16 @@
 //! Runs that are interrupted, doubled, damaged or given another dataset: nothing is lost, nothing is mixed.
 #![cfg(unix)]
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{BufRead, BufReader};
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant, SystemTime};
+use std::process::Child;
+use std::time::SystemTime;
 
 use nightsplat::gpu::testing::not_run;
 
-use crate::common::command::{command, refused, run, succeed};
-use crate::common::workspace::{Workspace, log};
+use crate::common::command::{command, refused, run, says, succeed};
+use crate::common::prelude::*;
+use crate::common::workspace::log;
 
 /// A training that has started and has thousands of steps to go.
 fn begun(arguments: &str) -> Child {
@@ -47,7 +47,7 @@ fn wait_for(path: &Path) {
 #[test]
 fn a_signal_saves_and_stops_and_the_run_resumes_to_the_same_bits() {
     let workspace = Workspace::new();
-    succeed(&workspace.train("straight", "--steps 400"));
+    workspace.trained("straight", "--steps 400");
     for (signal, code, message) in [("-INT", 130, "interrupted"), ("-TERM", 143, "terminated")] {
         let name = format!("stopped{signal}");
         let mut child = begun(&workspace.train(&name, "--steps 400"));
@@ -68,7 +68,7 @@ fn a_signal_saves_and_stops_and_the_run_resumes_to_the_same_bits() {
             "the run ended before the signal"
         );
         assert!(!workspace.path(&name).join(".lock").exists());
-        succeed(&workspace.train(&name, "--steps 400 --resume"));
+        workspace.trained(&name, "--steps 400 --resume");
         assert!(
             workspace.read(&format!("{name}/model.ply")) == workspace.read("straight/model.ply")
         );
@@ -115,18 +115,17 @@ fn a_run_that_is_to_finish_cools_down_and_is_complete_also_if_it_is_stopped_mean
     send("-USR2", &child);
     let (code, stderr) = ended(child);
     assert_eq!(code, 0, "{stderr}");
-    let metrics: serde_json::Value =
-        serde_json::from_slice(&workspace.read("asked/metrics.json")).unwrap();
+    let metrics = workspace.json("asked/metrics.json");
     assert_eq!(metrics["ended"]["reason"], "requested");
     assert!(metrics["steps"].as_u64().unwrap() < 900_000, "{}", metrics["steps"]);
-    assert!(succeed(&workspace.train("asked", &format!("{endless} --resume"))).contains("is done"));
+    assert!(workspace.trained("asked", &format!("{endless} --resume")).contains("is done"));
 
     let steps = "--steps 900 --hash-every 40";
     let child = begun(&workspace.train("stopped", steps));
     send("-INT", &child);
     assert_eq!(ended(child).0, 130);
     crate::common::copy(&workspace.path("stopped"), &workspace.path("again"));
-    let told = succeed(&workspace.train("stopped", &format!("{steps} --resume --finish")));
+    let told = workspace.trained("stopped", &format!("{steps} --resume --finish"));
     assert!(told.contains("its end was requested"), "{told}");
     // The request is recorded at its first step.
     let stops = format!("{steps} --resume --max-minutes 0.000001");
@@ -197,21 +196,21 @@ fn a_run_whose_time_is_up_asks_to_be_repeated_and_a_finished_one_does_not() {
         assert!(!workspace.path("run/done.json").exists() && rounds < 300);
     }
     assert!(rounds >= 2, "{rounds}");
-    succeed(&workspace.train("straight", "--steps 120"));
+    workspace.trained("straight", "--steps 120");
     assert!(workspace.read("run/model.ply") == workspace.read("straight/model.ply"));
     // Repeated: nothing is done, and no file changes.
     let modified = || fs::metadata(workspace.path("run/model.ply")).unwrap().modified().unwrap();
     let before = modified();
     assert!(succeed(&train).contains("is done"));
     assert_eq!(modified(), before);
-    succeed(&workspace.train("run", "--steps 130 --resume"));
+    workspace.trained("run", "--steps 130 --resume");
     assert!(modified() > before, "a longer run is another");
 }
 
 #[test]
 fn a_finished_run_is_kept_until_its_replacement_has_done_a_step() {
     let workspace = Workspace::new();
-    succeed(&workspace.train("run", "--steps 3"));
+    workspace.trained("run", "--steps 3");
     let before = workspace.read("run/model.ply");
     // A network too large for any device: the run fails after all earlier checks.
     let hopeless = "--overwrite --steps 3 --parts denoiser --denoiser-channels 16384";
@@ -224,9 +223,8 @@ fn a_finished_run_is_kept_until_its_replacement_has_done_a_step() {
         fs::rename(workspace.path("run").join(name), workspace.path("run/.replaced").join(name))
             .unwrap();
     }
-    fs::write(workspace.path("run/.tmpA1b2C3"), "half a checkpoint").unwrap();
-    fs::write(workspace.path("run/config.toml"), workspace.read("run/.replaced/config.toml"))
-        .unwrap();
+    workspace.write("run/.tmpA1b2C3", "half a checkpoint");
+    workspace.write("run/config.toml", workspace.read("run/.replaced/config.toml"));
     refused(
         &workspace.train("run", "--steps 3 --resume"),
         1,
@@ -235,7 +233,7 @@ fn a_finished_run_is_kept_until_its_replacement_has_done_a_step() {
     assert!(
         workspace.read("run/model.ply") == before && !workspace.path("run/.tmpA1b2C3").exists()
     );
-    succeed(&workspace.train("run", "--steps 4 --overwrite"));
+    workspace.trained("run", "--steps 4 --overwrite");
     assert!(workspace.read("run/model.ply") != before && !workspace.path("run/.replaced").exists());
 }
 
@@ -244,7 +242,7 @@ fn foreign_files_are_neither_replaced_nor_resumed() {
     let workspace = Workspace::new();
     fs::create_dir(workspace.path("theirs")).unwrap();
     for (file, content) in [("config.toml", "title = \"my app\"\n"), ("train.csv", "a,b\n")] {
-        fs::write(workspace.path("theirs").join(file), content).unwrap();
+        workspace.write(&format!("theirs/{file}"), content);
         for held in ["--resume", "--overwrite"] {
             refused(&workspace.train("theirs", held), 1, &["theirs", "no config.toml"]);
         }
@@ -257,7 +255,7 @@ fn foreign_files_are_neither_replaced_nor_resumed() {
 fn a_damaged_checkpoint_is_reported_and_the_previous_one_resumes_to_the_same_bits() {
     let workspace = Workspace::new();
     let options = "--steps 50 --checkpoint-every 20";
-    succeed(&workspace.train("run", options));
+    workspace.trained("run", options);
     let expected = workspace.read("run/model.ply");
     let checkpoint = workspace.path("run/checkpoint.safetensors");
     let whole = fs::read(&checkpoint).unwrap();
@@ -269,22 +267,19 @@ fn a_damaged_checkpoint_is_reported_and_the_previous_one_resumes_to_the_same_bit
     for damaged in [&flipped[..], &whole[..whole.len() - 7], b""] {
         fs::write(&checkpoint, damaged).unwrap();
         let (_, stderr) = run(&workspace.train("run", &format!("{options} --resume")), 0);
-        assert!(
-            stderr.contains("checkpoint.safetensors") && stderr.contains("previous checkpoint"),
-            "{stderr}"
-        );
+        says(&stderr, &["checkpoint.safetensors", "previous checkpoint"]);
         assert!(workspace.read("run/model.ply") == expected);
         fs::remove_file(workspace.path("run/done.json")).unwrap();
     }
     fs::write(&checkpoint, &flipped).unwrap();
-    fs::write(workspace.path("run/checkpoint.before.safetensors"), &flipped).unwrap();
+    workspace.write("run/checkpoint.before.safetensors", &flipped);
     refused(&workspace.train("run", &format!("{options} --resume")), 3, &["checksum"]);
 }
 
 #[test]
 fn a_run_resumes_only_with_its_own_dataset() {
     let workspace = Workspace::new();
-    succeed(&workspace.train("run", "--steps 12 --checkpoint-every 10"));
+    workspace.trained("run", "--steps 12 --checkpoint-every 10");
     let resumed = workspace.train("run", "--steps 14 --resume");
     let (photograph, other) =
         (workspace.path("set/low/003.png"), workspace.path("set/low/004.png"));
@@ -309,13 +304,13 @@ fn a_run_resumes_only_with_its_own_dataset() {
 fn a_relative_dataset_means_the_same_from_everywhere() {
     let workspace = Workspace::new();
     let train = "train set --out run --steps 2 --curve ap3 --plan none";
-    let output = command(train).current_dir(workspace.0.path()).output().unwrap();
+    let output = command(train).current_dir(&**workspace).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let eval = |config: &str| {
-        fs::write(workspace.path("run/config.toml"), config).unwrap();
-        succeed(&format!("eval {} --json", workspace.path("run").display()))
+        workspace.write("run/config.toml", config);
+        workspace.succeed("eval @run --json")
     };
-    let config = fs::read_to_string(workspace.path("run/config.toml")).unwrap();
+    let config = workspace.text("run/config.toml");
     let absolute = workspace.path("set").display().to_string();
     assert!(config.contains(&absolute), "{config}");
     let expected = eval(&config);
@@ -327,15 +322,15 @@ fn two_runs_and_a_resumed_one_have_equal_ledgers() {
     let workspace = Workspace::new();
     let options = "--steps 40 --hash-every 10 --checkpoint-every 25";
     for name in ["a", "b"] {
-        succeed(&workspace.train(name, options));
+        workspace.trained(name, options);
     }
     let ledger = workspace.read("a/hashes.csv");
     assert_eq!(ledger.iter().filter(|&&byte| byte == b'\n').count(), 5);
     assert!(workspace.read("b/hashes.csv") == ledger);
     fs::remove_file(workspace.path("b/done.json")).unwrap();
-    succeed(&workspace.train("b", &format!("{options} --resume")));
+    workspace.trained("b", &format!("{options} --resume"));
     assert!(workspace.read("b/hashes.csv") == ledger);
-    succeed(&workspace.train("c", &format!("{options} --seed 11")));
+    workspace.trained("c", &format!("{options} --seed 11"));
     assert!(workspace.read("c/hashes.csv") != ledger);
 }
 
@@ -359,7 +354,7 @@ fn hostile_names_break_no_table_and_reach_no_terminal() {
         stderr.contains("gone") && !(stdout + &stderr).contains(['\u{1b}', '\u{7}']),
         "{stderr:?}"
     );
-    let log = fs::read_to_string(workspace.path("run/train.csv")).unwrap();
+    let log = workspace.text("run/train.csv");
     assert_eq!(log.lines().count(), 10);
     assert!(log.contains(r#""a,\u{1b}[31mb""#), "{log}");
     refused("eval /nowhere\u{1b}[2J", 3, &[r"/nowhere\u{1b}[2J"]);
@@ -396,7 +391,7 @@ fn a_finished_run_is_recognised_without_decoding_a_photograph() {
     fs::write(&photograph, &bytes).unwrap();
     set_modified(&photograph, time + Duration::from_secs(5));
     assert!(succeed(&train).contains("is done"));
-    fs::write(&photograph, fs::read(workspace.path("set/low/002.png")).unwrap()).unwrap();
+    fs::write(&photograph, workspace.read("set/low/002.png")).unwrap();
     refused(&train, 3, &["view 001 shows other pixels"]);
 }
 

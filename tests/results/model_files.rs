@@ -1,23 +1,18 @@
 //! Model files: as initial models, and rendered, scored and exported without a run.
 
-use std::fs;
-use std::path::Path;
-
-use glam::DVec3;
 use nightsplat::Error;
 use nightsplat::results::run::load_config;
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::{Gaussians, ply};
 
-use crate::common::command::{refused, run, succeed};
-use crate::common::workspace::Workspace;
+use crate::common::command::{Folder, json, refused, run, succeed};
+use crate::common::prelude::*;
 
 #[test]
 fn a_run_starts_from_a_model_and_its_highest_sh_degree() {
     let workspace = Workspace::new();
-    succeed(&workspace.train("first", "--steps 30"));
+    workspace.trained("first", "--steps 30");
     let model = workspace.path("first/model.ply");
-    succeed(&workspace.train("second", &format!("--steps 1 --init {}", model.display())));
+    workspace.trained("second", &format!("--steps 1 --init {}", model.display()));
     let [first, second] =
         ["first", "second"].map(|run| ply::load(workspace.path(run).join("model.ply")).unwrap());
     // The first run has not reached a higher degree; the second uses it from its first step.
@@ -25,14 +20,14 @@ fn a_run_starts_from_a_model_and_its_highest_sh_degree() {
     assert_eq!(first.count, second.count);
     let moved = first.means().iter().zip(second.means()).map(|(a, b)| a.distance(*b));
     assert!(moved.fold(0.0, f32::max) < 0.05, "they began elsewhere");
-    let config = fs::read_to_string(workspace.path("second/config.toml")).unwrap();
+    let config = workspace.text("second/config.toml");
     assert!(config.contains("first/model.ply"), "{config}");
 
     // From another program: without our features, with additional properties, of a lower degree.
     let bytes = with_property(&fs::read(&model).unwrap());
-    fs::write(workspace.path("foreign.ply"), bytes).unwrap();
+    workspace.write("foreign.ply", bytes);
     let foreign = workspace.path("foreign.ply");
-    succeed(&workspace.train("third", &format!("--steps 1 --init {}", foreign.display())));
+    workspace.trained("third", &format!("--steps 1 --init {}", foreign.display()));
 }
 
 /// A binary PLY with an additional float in every vertex.
@@ -53,7 +48,7 @@ fn with_property(bytes: &[u8]) -> Vec<u8> {
 fn an_unsuitable_initial_model_is_refused_in_one_line_with_file_and_rule() {
     let workspace = Workspace::new();
     let file = |name: &str, bytes: &[u8]| {
-        fs::write(workspace.path(name), bytes).unwrap();
+        workspace.write(name, bytes);
     };
     // All zeros; the file is text.
     ply::save(&Gaussians::zeros(2, 2), workspace.path("degree.ply")).unwrap();
@@ -71,7 +66,7 @@ fn an_unsuitable_initial_model_is_refused_in_one_line_with_file_and_rule() {
         ("origin.ply", "names the origin `1 2`, which is not three finite numbers"),
         ("none.ply", "none.ply"),
     ] {
-        let options = format!("--steps 1 --init {}", workspace.path(name).display());
+        let options = format!("--steps 1 --init @{name}");
         refused(&workspace.train("run", &options), 3, &[name, rule]);
     }
 }
@@ -79,36 +74,36 @@ fn an_unsuitable_initial_model_is_refused_in_one_line_with_file_and_rule() {
 #[test]
 fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
     let workspace = Workspace::new();
-    succeed(&workspace.train("run", "--steps 40"));
+    workspace.trained("run", "--steps 40");
     let (model, set) = (workspace.path("copy.ply"), workspace.path("set"));
     fs::copy(workspace.path("run/model.ply"), &model).unwrap();
     let (model, set) = (model.display(), set.display());
 
-    let (scores, message) = run(&format!("eval {model} --dataset {set} --json"), 0);
+    let (scores, message) = workspace.run(&format!("eval {model} --dataset {set} --json"), 0);
     assert!(!message.contains("near plane"), "{message}");
-    let psnr = |json: &str| {
-        let json: serde_json::Value = serde_json::from_str(json).unwrap();
-        json["mean"]["psnr"].as_f64().unwrap()
-    };
-    let of_run = succeed(&format!("eval {} --json", workspace.path("run").display()));
+    let psnr = |scores: &str| json(scores)["mean"]["psnr"].as_f64().unwrap();
+    let of_run = workspace.succeed("eval @run --json");
     assert!((psnr(&scores) - psnr(&of_run)).abs() < 1e-6, "{scores} {of_run}");
-    refused(&format!("eval {model}"), 3, &["copy.ply", "--dataset"]);
+    workspace.refused(&format!("eval {model}"), 3, &["copy.ply", "--dataset"]);
 
     let pictures = workspace.path("pictures");
-    succeed(&format!("render {model} --dataset {set} --split test --out {}", pictures.display()));
+    workspace.succeed(&format!(
+        "render {model} --dataset {set} --split test --out {}",
+        pictures.display()
+    ));
     assert!(fs::read_dir(pictures).unwrap().count() > 0);
 
     for to in ["spz", "glb", "sog"] {
-        succeed(&format!("export {model} --format {to} --up none"));
+        workspace.succeed(&format!("export {model} --format {to} --up none"));
         assert!(workspace.path(&format!("copy.{to}")).is_file(), "{to}");
     }
     for (file, loss) in [("copy.spz", 0.5), ("copy.sog", 0.5)] {
         let packed = workspace.path(file);
-        let shown = succeed(&format!("eval {} --dataset {set} --json", packed.display()));
+        let shown = workspace.succeed(&format!("eval {} --dataset {set} --json", packed.display()));
         assert!((psnr(&shown) - psnr(&of_run)).abs() < loss, "{file}: {shown} {of_run}");
     }
-    succeed(&format!("export {model} --format html --dataset {set}"));
-    refused(&format!("export {model} --format html"), 3, &["copy.ply", "--dataset"]);
+    workspace.succeed(&format!("export {model} --format html --dataset {set}"));
+    workspace.refused(&format!("export {model} --format html"), 3, &["copy.ply", "--dataset"]);
 }
 
 /// Removes the facts that the file states.
@@ -133,7 +128,7 @@ fn without_facts(path: &Path) {
 #[test]
 fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_defaults() {
     let workspace = Workspace::new();
-    succeed(&workspace.train("run", "--steps 5 --near 0.05 --raw-colors on"));
+    workspace.trained("run", "--steps 5 --near 0.05 --raw-colors on");
     let run_folder = workspace.path("run");
     let scale = load_config(&run_folder).unwrap().frame.unwrap_or_default().scale;
     let model = Model::load(&run_folder).unwrap();
@@ -170,8 +165,7 @@ fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_de
     model.save(&glb).unwrap();
     let glb = fs::read(glb).unwrap();
     let length = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
-    let json: serde_json::Value = serde_json::from_slice(&glb[20..20 + length]).unwrap();
-    let stated = &json["asset"]["extras"]["nightsplat"];
+    let stated = &json(&glb[20..20 + length])["asset"]["extras"]["nightsplat"];
     assert_eq!(stated["near"].to_string(), model.near.to_string());
     assert_eq!(stated["raw_colors"], true);
 
@@ -188,8 +182,8 @@ fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_de
 
 #[test]
 fn an_invalid_fact_in_a_file_is_an_error_of_one_line() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("model.ply");
+    let folder = Folder::empty();
+    let path = folder.path("model.ply");
     let problem = |comment: &str| {
         Model::from(Gaussians::zeros(2, 0)).save(&path).unwrap();
         // All zeros: the file is text.
@@ -229,14 +223,14 @@ fn an_invalid_fact_in_a_file_is_an_error_of_one_line() {
     fs::write(&path, "solid cube").unwrap();
     let error = Model::load(&path).unwrap_err().to_string();
     assert!(error.contains("model.ply: is not a model: neither PLY, SPZ nor SOG"), "{error}");
-    let error = Model::load(folder.path()).unwrap_err().to_string();
+    let error = Model::load(&folder).unwrap_err().to_string();
     assert!(error.contains("no config.toml"), "{error}");
 }
 
 #[test]
 fn an_export_keeps_the_origin_and_the_page_the_near_plane() {
     let workspace = Workspace::new();
-    succeed(&workspace.train("run", "--steps 5 --near 0.5"));
+    workspace.trained("run", "--steps 5 --near 0.5");
     let path = workspace.path("run/model.ply");
     let mut gaussians = ply::load(&path).unwrap();
     gaussians.origin = DVec3::new(4_499_999.6, 519_997.7, 10_001.8);
@@ -261,21 +255,20 @@ fn an_export_keeps_the_origin_and_the_page_the_near_plane() {
 #[test]
 fn training_far_from_the_origin_of_the_world_says_what_positions_are_relative_to() {
     let workspace = Workspace::new();
-    let near = succeed(&workspace.train("near", "--steps 2"));
+    let near = workspace.trained("near", "--steps 2");
     assert!(!near.contains("relative"), "{near}");
     for listing in ["transforms_train.json", "transforms_test.json"] {
         let path = workspace.path("set").join(listing);
-        let mut listed: serde_json::Value =
-            serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+        let mut listed: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
         for frame in listed["frames"].as_array_mut().unwrap() {
             let x = &mut frame["transform_matrix"][0][3];
             *x = (x.as_f64().unwrap() + 448_262.5).into();
         }
         fs::write(&path, listed.to_string()).unwrap();
     }
-    let far = succeed(&workspace.train("far", "--steps 2"));
+    let far = workspace.trained("far", "--steps 2");
     assert!(far.contains("model.ply: positions are relative"), "{far}");
-    let header = fs::read(workspace.path("far/model.ply")).unwrap();
+    let header = workspace.read("far/model.ply");
     let header = String::from_utf8_lossy(&header[..400]).into_owned();
     let origin = header.lines().find(|line| line.contains("world = position + ")).unwrap();
     assert!(far.contains(origin.trim_start_matches("comment ")), "{origin}: {far}");

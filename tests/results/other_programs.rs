@@ -1,75 +1,63 @@
 //! Pictures of other programs: renders that are scored like our own, targets that are trained on, formulas in sweeps.
 
-use std::fs;
+use nightsplat_photographs::image::ImageFile as _;
 
-use nightsplat::train::TrainConfig;
-use nightsplat_photographs::image::{Image, ImageFile as _};
-use serde_json::Value;
-
-use crate::common::command::{refused, run, succeed};
-use crate::common::workspace::Workspace;
-
-fn json(stdout: &str) -> Value {
-    serde_json::from_str(stdout).unwrap()
-}
+use crate::common::command::json;
+use crate::common::prelude::*;
 
 #[test]
 fn renders_of_another_program_are_scored_like_our_own() {
     let workspace = Workspace::new();
     let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&workspace.train("a", "--steps 20"));
-    let ours = json(&succeed(&format!("eval {} --save-images --json", path("a"))));
+    workspace.trained("a", "--steps 20");
+    let ours = json(workspace.succeed("eval @a --save-images --json"));
     // Our renders in another folder are those of another program.
     fs::rename(workspace.path("a/eval/renders"), workspace.path("theirs")).unwrap();
     let page = path("page.html");
-    let eval = format!("eval {} --renders {}", path("a"), path("theirs"));
-    let theirs = json(&succeed(&format!("{eval} --report {page} --json")));
+    let eval = "eval @a --renders @theirs";
+    let theirs = json(workspace.succeed(&format!("{eval} --report {page} --json")));
     assert_eq!((&theirs["mean"], &theirs["views"]), (&ours["mean"], &ours["views"]));
     assert!(theirs["gaussians"].is_null() && theirs["renders"] == path("theirs"), "{theirs}");
     assert!(fs::read_to_string(&page).unwrap().contains("theirs"));
 
-    let compare = format!("compare {} --renders gsplat={}", path("a"), path("theirs"));
-    let stdout = succeed(&format!("{compare} --report {page}"));
+    let compare = "compare @a --renders gsplat=@theirs";
+    let stdout = workspace.succeed(&format!("{compare} --report {page}"));
     assert!(stdout.contains("gsplat gains"), "{stdout}");
     let html = fs::read_to_string(&page).unwrap();
     assert!(html.contains("Comparison of a, gsplat") && html.contains(">gsplat<"), "{html}");
-    let runs = json(&succeed(&format!("{compare} --json")))["runs"].clone();
+    let runs = json(workspace.succeed(&format!("{compare} --json")))["runs"].clone();
     assert_eq!(runs[0]["mean"]["psnr"], runs[1]["mean"]["psnr"]);
     assert!(runs[1]["run"] == "gsplat" && runs[1]["gaussians"].is_null(), "{runs}");
 
     // Beside a formula of one's own, both by their names.
-    let sweep = format!(
-        "sweep {} --out {} --curves ap3,min(t*a,1)^0.5;a=0.7 --steps 2 --sh-degree 0 --renders gsplat={}",
-        path("set"),
-        path("sweep"),
-        path("theirs")
-    );
-    let stdout = succeed(&sweep);
+    let sweep = "sweep @set --out @sweep --curves ap3,min(t*a,1)^0.5;a=0.7 --steps 2 --sh-degree 0 \
+                 --renders gsplat=@theirs";
+    let stdout = workspace.succeed(sweep);
     assert!(stdout.contains("min(t*a,1)^0.5;a=0.7") && stdout.contains("gsplat"), "{stdout}");
-    let csv = fs::read_to_string(workspace.path("sweep/leaderboard.csv")).unwrap();
+    let csv = workspace.text("sweep/leaderboard.csv");
     assert_eq!(csv.lines().count(), 4, "{csv}");
     let row = csv.lines().find(|line| line.contains("gsplat")).unwrap();
     assert!(row.contains(&ours["mean"]["psnr"].to_string()), "{row}");
-    let html = fs::read_to_string(workspace.path("sweep/index.html")).unwrap();
+    let html = workspace.text("sweep/index.html");
     assert!(html.contains("min(t*a,1)^0.5;a=0.7") && html.contains(">gsplat<"));
 
     // What is superfluous, of another size or missing is named.
     let stray = workspace.path("theirs/stray.png");
     Image::filled(5, 5, [0.5; 3]).save_png8(&stray).unwrap();
-    let (_, message) = run(&eval, 0);
+    let (_, message) = workspace.run(eval, 0);
     assert!(message.contains("no view is named like stray.png"), "{message}");
     fs::remove_file(&stray).unwrap();
     let files = fs::read_dir(workspace.path("theirs")).unwrap().flatten().map(|file| file.path());
     let name = files.min().unwrap();
     Image::filled(5, 5, [0.5; 3]).save_png8(&name).unwrap();
-    refused(&eval, 3, &[name.to_str().unwrap(), "is 5x5, its view 40x30", "--downscale"]);
+    workspace.refused(eval, 3, &[name.to_str().unwrap(), "is 5x5, its view 40x30", "--downscale"]);
     fs::rename(&name, &stray).unwrap();
     let view = name.file_stem().unwrap().to_str().unwrap();
-    refused(&compare, 3, &["theirs", "no picture of the test views", view, "stray.png"]);
-    refused(&sweep, 3, &["no picture of the test views", view]);
-    refused(&format!("compare {} --renders theirs", path("a")), 2, &["NAME=DIR"]);
+    workspace.refused(compare, 3, &["theirs", "no picture of the test views", view, "stray.png"]);
+    workspace.refused(sweep, 3, &["no picture of the test views", view]);
+    workspace.refused("compare @a --renders theirs", 2, &["NAME=DIR"]);
     fs::remove_dir_all(workspace.path("set/high")).unwrap();
-    refused(&sweep, 3, &["no reference images", "nightsplat compare"]);
+    workspace.refused(sweep, 3, &["no reference images", "nightsplat compare"]);
 }
 
 #[test]
@@ -77,64 +65,60 @@ fn targets_of_another_program_are_trained_on_and_labelled_everywhere() {
     let workspace = Workspace::new();
     let path = |name: &str| workspace.path(name).display().to_string();
     let (set, toned) = (path("set"), path("toned"));
-    succeed(&format!("tone apply {set} --curve ap3 --out {toned}"));
+    workspace.succeed(&format!("tone apply {set} --curve ap3 --out {toned}"));
     let train = |out: &str, options: &str| {
-        format!("train {set} --out {} --model plain --sh-degree 1 --steps 30 {options}", path(out))
+        format!("train {set} --out @{out} --model plain --sh-degree 1 --steps 30 {options}")
     };
-    let (stdout, message) = run(&train("theirs", &format!("--targets {toned}")), 0);
+    let (stdout, message) = workspace.run(&train("theirs", &format!("--targets {toned}")), 0);
     let printed = (stdout + &message).split_whitespace().collect::<Vec<_>>().join(" ");
     assert!(printed.contains("targets of another program, toned"), "{printed}");
     assert!(printed.contains("% of their pixels are clipped at white"), "{printed}");
 
     // Only the rounding to 8 bits differs from the curve that made them.
-    succeed(&train("ours", "--curve ap3"));
+    workspace.succeed(&train("ours", "--curve ap3"));
     let psnr = |run: &str| {
-        json(&succeed(&format!("eval {} --json", path(run))))["mean"]["psnr"].as_f64().unwrap()
+        json(workspace.succeed(&format!("eval @{run} --json")))["mean"]["psnr"].as_f64().unwrap()
     };
     let [theirs, ours] = ["theirs", "ours"].map(psnr);
     assert!((theirs - ours).abs() < 0.3, "{theirs} and {ours} dB");
 
-    let config = fs::read_to_string(workspace.path("theirs/config.toml")).unwrap();
+    let config = workspace.text("theirs/config.toml");
     assert!(config.contains("curve = \"targets\""), "{config}");
     let config: TrainConfig = toml::from_str(&config).unwrap();
     assert_eq!(config.tone.targets(), Some(workspace.path("toned").as_path()));
-    let metrics = json(&fs::read_to_string(workspace.path("theirs/metrics.json")).unwrap());
+    let metrics = json(workspace.text("theirs/metrics.json"));
     assert_eq!(metrics["targets"], "targets of another program, toned");
-    let plan = fs::read_to_string(workspace.path("theirs/plan.toml")).unwrap();
+    let plan = workspace.text("theirs/plan.toml");
     assert!(plan.contains("targets of another program, toned"), "{plan}");
     let header = |run: &str| String::from_utf8_lossy(&workspace.model(run)[..3000]).into_owned();
     let law = "comment nightsplat law";
     assert!(header("ours").contains(law) && !header("theirs").contains(law));
-    refused(
-        &format!(
-            "render {} --split all --as linear --format exr --out {}",
-            path("theirs"),
-            path("linear")
-        ),
+    workspace.refused(
+        "render @theirs --split all --as linear --format exr --out @linear",
         2,
         &["targets of another program have no curve"],
     );
 
     // Resumed runs keep them, and what scores compare with is printed.
     fs::remove_dir_all(workspace.path("set/high")).unwrap();
-    let label = json(&succeed(&format!("eval {} --json", path("theirs"))))["against"].clone();
+    let label = json(workspace.succeed("eval @theirs --json"))["against"].clone();
     assert!(label.as_str().unwrap().contains("targets of another program"), "{label}");
 
     let targets = |options: &str| train("no", &format!("--targets {toned} --plan none {options}"));
-    refused(&targets("--curve ap3"), 2, &["--targets", "--curve"]);
-    refused(
-        &train("no", &format!("--plan none --targets {}", path("nowhere"))),
+    workspace.refused(&targets("--curve ap3"), 2, &["--targets", "--curve"]);
+    workspace.refused(
+        &train("no", "--plan none --targets @nowhere"),
         3,
         &["nowhere", "folder of targets"],
     );
     let first = workspace.path("toned/001.png");
     fs::rename(&first, workspace.path("toned/stray.png")).unwrap();
-    refused(&targets(""), 3, &["toned", "no target for 1 of", "001"]);
+    workspace.refused(&targets(""), 3, &["toned", "no target for 1 of", "001"]);
     Image::filled(20, 16, [1.0; 3]).save_png8(&first).unwrap();
-    refused(&targets(""), 3, &["001.png", "is 20x16, its photograph 40x30"]);
+    workspace.refused(&targets(""), 3, &["001.png", "is 20x16, its photograph 40x30"]);
     // As PNG of 16 bits, white: more than a hundredth of all pixels.
     Image::filled(40, 30, [1.0; 3]).save_png16(&first).unwrap();
-    let (_, message) = run(&targets(""), 0);
+    let (_, message) = workspace.run(&targets(""), 0);
     assert!(message.contains("detail is lost") && message.contains("most in 001"), "{message}");
     assert!(message.contains("1 more pictures are of no photograph, stray the first"), "{message}");
 }

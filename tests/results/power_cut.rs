@@ -1,14 +1,10 @@
 //! What a power cut leaves: the order in which a run flushes and renames its files, as strace records it.
 #![cfg(target_os = "linux")]
 
-use std::collections::BTreeMap;
-use std::path::Path;
-use std::process::Command;
-
 use nightsplat::gpu::testing::not_run;
 
 use crate::common::command::command;
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 /// What happens to a file of the run, by its name; the folder itself is "".
 #[derive(Debug, PartialEq)]
@@ -81,7 +77,7 @@ fn files_are_on_the_disk_before_what_relies_on_them() {
     traced.envs(train.get_envs().filter_map(|(name, value)| Some((name, value?))));
     let output = traced.output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let trace = std::fs::read_to_string(trace).unwrap();
+    let trace = fs::read_to_string(trace).unwrap();
     let events = events(&trace, &workspace.path("run").canonicalize().unwrap());
 
     let (mut disk, mut checkpoints, mut is_done) = (Disk::default(), 0, false);

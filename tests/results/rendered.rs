@@ -1,12 +1,6 @@
 //! Layers, sizes, backgrounds and camera paths of renders.
 
-use std::fs;
-use std::path::Path;
-
-use nightsplat_photographs::image::{Image, ImageFile};
-
-use crate::common::command::{refused, succeed};
-use crate::common::workspace::Workspace;
+use crate::common::prelude::*;
 
 fn image(path: &Path) -> Image {
     Image::load(path).unwrap()
@@ -15,10 +9,9 @@ fn image(path: &Path) -> Image {
 #[test]
 fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&workspace.train("run", "--steps 40"));
+    workspace.trained("run", "--steps 40");
     let render = |options: &str, out: &str| {
-        succeed(&format!("render {} --split test {options} --out {}", path("run"), path(out)));
+        workspace.succeed(&format!("render @run --split test {options} --out @{out}"));
         let mut files: Vec<_> =
             fs::read_dir(workspace.path(out)).unwrap().map(|entry| entry.unwrap().path()).collect();
         files.sort();
@@ -33,8 +26,7 @@ fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
     assert!(opaque.count() > 100);
     for layer in ["depth", "normal"] {
         let shown = image(&render(&format!("--layer {layer}"), layer));
-        let distinct: std::collections::BTreeSet<u32> =
-            shown.data.iter().map(|value| value.to_bits()).collect();
+        let distinct: BTreeSet<u32> = shown.data.iter().map(|value| value.to_bits()).collect();
         assert!(distinct.len() > 20, "{layer}");
     }
     let near = image(&render("--layer depth --depth-range 0,0.001", "near"));
@@ -48,8 +40,8 @@ fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
             "{color:?}"
         );
     }
-    refused(
-        &format!("render {} --split test --layer noise --out {}", path("run"), path("noise")),
+    workspace.refused(
+        "render @run --split test --layer noise --out @noise",
         2,
         &["has no noise; it has rgb, depth, normal"],
     );
@@ -59,35 +51,31 @@ fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
 fn views_and_paths_are_rendered_at_a_size_with_a_field_of_view_over_a_background() {
     let workspace = Workspace::new();
     let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&workspace.train("run", "--steps 10"));
-    let render =
-        |options: &str, out: &str| format!("render {} {options} --out {}", path("run"), path(out));
-    succeed(&render("--split test --size 64x24 --fov 20", "wide"));
+    workspace.trained("run", "--steps 10");
+    let render = |options: &str, out: &str| format!("render @run {options} --out @{out}");
+    workspace.succeed(&render("--split test --size 64x24 --fov 20", "wide"));
     let file = fs::read_dir(workspace.path("wide")).unwrap().next().unwrap().unwrap().path();
     assert_eq!([image(&file).width, image(&file).height], [64, 24]);
 
     let keyframes = r#"{"nightsplat_path": 1, "fps": 2, "fov": 40, "size": [32, 16], "keyframes": [
         {"time": 0, "position": [0, 0, 0], "target": [0, 0, 100]},
         {"time": 2, "position": [0, 0, 0], "target": [100, 0, 100]}]}"#;
-    fs::write(workspace.path("path.json"), keyframes).unwrap();
+    workspace.write("path.json", keyframes);
     let file = path("path.json");
-    succeed(&render(&format!("--path {file} --background #ff0000"), "film"));
+    workspace.succeed(&render(&format!("--path {file} --background #ff0000"), "film"));
     assert_eq!(fs::read_dir(workspace.path("film")).unwrap().count(), 5);
     assert_eq!([image(&workspace.path("film/00000.png")).width], [32]);
     // Far from everything, only the background is seen.
     let far = path("far.json");
-    fs::write(
-        workspace.path("far.json"),
-        keyframes.replace("[0, 0, 0]", "[0, 0, 1e5]").replace("100]", "1e7]"),
-    )
-    .unwrap();
-    succeed(&render(&format!("--path {far} --frames 1 --background 1,0,0"), "far"));
+    workspace
+        .write("far.json", keyframes.replace("[0, 0, 0]", "[0, 0, 1e5]").replace("100]", "1e7]"));
+    workspace.succeed(&render(&format!("--path {far} --frames 1 --background 1,0,0"), "far"));
     let far = image(&workspace.path("far/00000.png"));
     assert!(far.data[..512].iter().all(|value| *value == 1.0), "no red");
     assert!(far.data[512..].iter().all(|value| *value == 0.0));
 
-    fs::write(workspace.path("path.json"), keyframes.replace("path\": 1", "path\": 7")).unwrap();
-    refused(&render(&format!("--path {file}"), "no"), 3, &["path.json", "version 7"]);
+    workspace.write("path.json", keyframes.replace("path\": 1", "path\": 7"));
+    workspace.refused(&render(&format!("--path {file}"), "no"), 3, &["path.json", "version 7"]);
     for (options, part) in [
         ("--path nowhere.json", "nor a file"),
         ("--split test --size 0x4", "is not WIDTHxHEIGHT"),
@@ -96,7 +84,7 @@ fn views_and_paths_are_rendered_at_a_size_with_a_field_of_view_over_a_background
         ("--split test --depth-range 2,1", "the nearer first"),
         ("--path orbit --loop", "--easing and --loop are of keyframes"),
     ] {
-        refused(&render(options, "no"), 2, &[part]);
+        workspace.refused(&render(options, "no"), 2, &[part]);
     }
     assert!(!workspace.path("no").exists());
 }

@@ -1,5 +1,6 @@
 //! The page is self-contained, escapes all text and highlights the best values.
 
+use crate::common::command::says;
 use nightsplat::results::report::{
     Best, Chart, Column, Comparison, Distribution, Mark, NumberTable, Picture, Report, Series,
     TextTable, distributions,
@@ -44,12 +45,7 @@ fn a_table_in_markdown_marks_the_best_of_each_column() {
 fn a_table_in_html_marks_the_same_values() {
     let html = table().html();
     assert_eq!(html.matches("class=\"best\"").count(), 3);
-    assert!(
-        html.contains(
-            "<td>ap3</td><td class=\"best\">25.00</td><td class=\"best\">30</td><td>–</td>"
-        ),
-        "{html}"
-    );
+    says(&html, &["<td>ap3</td><td class=\"best\">25.00</td><td class=\"best\">30</td><td>–</td>"]);
     assert!(html.contains("Scores &lt;test&gt;"));
 }
 
@@ -163,9 +159,7 @@ fn a_plot_draws_each_series_within_its_frame() {
     );
     // A larger value is higher up.
     assert!(points[0][0].1 < points[0][1].1);
-    for label in [">0.3<", ">100<", ">step<", ">loss<", ">linear<"] {
-        assert!(svg.contains(label), "{label} is missing in {svg}");
-    }
+    says(&svg, &[">0.3<", ">100<", ">step<", ">loss<", ">linear<"]);
 }
 
 #[test]

@@ -1,71 +1,57 @@
 //! Scores that are asked for after a training: references found later, LPIPS of a sweep.
 
-use std::fs;
-use std::path::Path;
-
 use nightsplat::networks::lpips::Network;
-use serde_json::Value;
 
-use crate::common::command::{refused, run, succeed};
+use crate::common::command::json;
 use crate::common::lpips;
-use crate::common::workspace::Workspace;
-
-fn json(stdout: &str) -> Value {
-    serde_json::from_str(stdout).unwrap()
-}
+use crate::common::prelude::*;
 
 #[test]
 fn references_that_are_found_later_give_the_scores_of_a_dataset_that_had_them() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
-    succeed(&workspace.train("known", "--steps 20"));
-    let known = json(&succeed(&format!("eval {} --json", path("known"))));
+    workspace.trained("known", "--steps 20");
+    let known = json(workspace.succeed("eval @known --json"));
     // The same dataset, before anyone had photographed it in normal light.
     fs::rename(workspace.path("set/high"), workspace.path("found")).unwrap();
-    succeed(&workspace.train("run", "--steps 20"));
+    workspace.trained("run", "--steps 20");
     assert!(workspace.model("run") == workspace.model("known"), "references changed the model");
-    let scores_of_targets = json(&succeed(&format!("eval {} --json", path("run"))));
+    let scores_of_targets = json(workspace.succeed("eval @run --json"));
     assert_ne!(scores_of_targets["mean"]["psnr"], known["mean"]["psnr"]);
-    let eval = format!("eval {} --reference {}", path("run"), path("found"));
-    let later = json(&succeed(&format!("{eval} --json")));
+    let eval = "eval @run --reference @found";
+    let later = json(workspace.succeed(&format!("{eval} --json")));
     assert_eq!((&later["mean"], &later["views"]), (&known["mean"], &known["views"]));
 
     // A model file alone is scored likewise, with the images and the page that are asked for.
     fs::copy(workspace.path("run/model.ply"), workspace.path("model.ply")).unwrap();
-    let more = format!("--save-images --report {}", path("page.html"));
-    let eval = format!("eval {} --dataset {} ", path("model.ply"), path("set"));
-    let reference = format!("--reference {}", path("found"));
-    let of_file = json(&succeed(&format!("{eval} {reference} {more} --json")));
+    let more = "--save-images --report @page.html";
+    let eval = "eval @model.ply --dataset @set ";
+    let reference = "--reference @found";
+    let of_file = json(workspace.succeed(&format!("{eval} {reference} {more} --json")));
     let psnr = |scores: &Value| scores["mean"]["psnr"].as_f64().unwrap();
     assert!((psnr(&of_file) - psnr(&known)).abs() < 1e-9, "{of_file}");
-    assert!(fs::read_to_string(workspace.path("page.html")).unwrap().contains("reference image<"));
+    assert!(workspace.text("page.html").contains("reference image<"));
     assert!(fs::read_dir(workspace.path("model.eval")).unwrap().count() > 0);
 
     fs::remove_file(workspace.path("page.html")).unwrap();
-    let nowhere = format!("{eval} --reference {} {more}", path("nowhere"));
-    refused(&nowhere, 3, &["nowhere"]);
+    let nowhere = format!("{eval} --reference @nowhere {more}");
+    workspace.refused(&nowhere, 3, &["nowhere"]);
     assert!(!workspace.path("page.html").exists());
 }
 
 #[test]
 fn a_sweep_adds_lpips_to_its_tables_and_scores_no_run_again() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
     let weights = workspace.path("weights.safetensors");
     // The network has no output for smaller images.
-    succeed(&format!("synth {} --views 9 --width 48 --height 36", path("large")));
+    workspace.succeed("synth @large --views 9 --width 48 --height 36");
     lpips::write(Network::Alex, &weights, |_, _, _| {});
-    let sweep = format!(
-        "sweep {} --out {} --curves ap3,ase --steps 2 --sh-degree 0",
-        path("large"),
-        path("sweep")
-    );
-    let stdout = succeed(&sweep);
+    let sweep = "sweep @large --out @sweep --curves ap3,ase --steps 2 --sh-degree 0";
+    let stdout = workspace.succeed(sweep);
     assert!(!stdout.contains("LPIPS"), "{stdout}");
     let with = format!("{sweep} --lpips {}", weights.display());
-    let (stdout, message) = run(&with, 0);
+    let (stdout, message) = workspace.run(&with, 0);
     assert!(stdout.contains("LPIPS") && !message.contains("finished"), "{stdout}\n{message}");
-    let runs = |folder: &Path| -> Vec<std::path::PathBuf> {
+    let runs = |folder: &Path| -> Vec<PathBuf> {
         let all = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
         all.filter(|path| path.join("model.ply").exists()).collect()
     };
@@ -73,15 +59,15 @@ fn a_sweep_adds_lpips_to_its_tables_and_scores_no_run_again() {
     assert_eq!(found.len(), 2);
     for folder in &found {
         let eval = format!("eval {} --lpips {} --json", folder.display(), weights.display());
-        let lpips_of_run = json(&succeed(&eval))["mean"]["lpips"].as_f64().unwrap();
+        let lpips_of_run = json(workspace.succeed(&eval))["mean"]["lpips"].as_f64().unwrap();
         assert!(stdout.contains(&format!("{lpips_of_run:.3}")), "{lpips_of_run}: {stdout}");
     }
-    let (again, _) = run(&with, 0);
+    let (again, _) = workspace.run(&with, 0);
     assert_eq!(stdout, again);
 
     fs::write(&weights, "no weights").unwrap();
     let other = workspace.path("other.safetensors");
     fs::write(&other, "no weights").unwrap();
-    refused(&format!("{sweep} --lpips {}", other.display()), 3, &["other.safetensors"]);
-    refused(&format!("{sweep} --lpips-range unit"), 2, &["--lpips <WEIGHTS>"]);
+    workspace.refused(&format!("{sweep} --lpips {}", other.display()), 3, &["other.safetensors"]);
+    workspace.refused(&format!("{sweep} --lpips-range unit"), 2, &["--lpips <WEIGHTS>"]);
 }

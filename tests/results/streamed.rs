@@ -1,20 +1,15 @@
 //! Streamed SOG: its index, its chunks, and what is refused.
 
-use std::fs;
 use std::io::{Cursor, Write as _};
-use std::path::Path;
 
-use glam::DVec3;
 use nightsplat::results::export::Provenance;
 use nightsplat::results::export::streamed::{self, Division, INDEX, TileLoader, Written};
 use nightsplat::splats::levels::level;
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::{Gaussians, ply};
-use nightsplat_core::random::Stream;
-use serde_json::Value;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
-use crate::common::command::{refused, succeed};
+use crate::common::command::{Folder, refused, succeed};
+use crate::common::prelude::*;
 
 /// Tiles of 300 and of 130 Gaussians side by side, each with an origin of its own.
 fn tiles() -> [Gaussians; 2] {
@@ -187,41 +182,37 @@ fn the_same_tiles_are_the_same_bytes_and_replace_an_earlier_export() {
 
 #[test]
 fn a_folder_with_anything_else_and_tiles_that_changed_are_refused_and_nothing_is_lost() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = Folder::empty();
     let [model, _] = tiles();
     let division = Division::default();
-    fs::write(folder.path().join("letter.txt"), "mine").unwrap();
-    let problem =
-        written(folder.path(), std::slice::from_ref(&model), division).unwrap_err().to_string();
-    assert!(problem.contains("letter.txt") && files(folder.path()).len() == 1, "{problem}");
-    fs::remove_file(folder.path().join("letter.txt")).unwrap();
+    folder.write("letter.txt", "mine");
+    let problem = written(&folder, std::slice::from_ref(&model), division).unwrap_err().to_string();
+    assert!(problem.contains("letter.txt") && files(&folder).len() == 1, "{problem}");
+    fs::remove_file(folder.path("letter.txt")).unwrap();
 
     let mut tile = TileLoader::whole(Path::new("0007.ply"), &model);
     tile.count += 1;
     let provenance = Provenance::default();
-    let problem = streamed::write(folder.path(), &[tile], &provenance, division).unwrap_err();
+    let problem = streamed::write(&folder, &[tile], &provenance, division).unwrap_err();
     assert!(problem.to_string().contains("0007.ply: has 300 Gaussians, not 301"), "{problem}");
-    assert!(!folder.path().join(INDEX).exists());
-    let problem = written(folder.path(), &[Gaussians::zeros(0, 1)], division).unwrap_err();
+    assert!(!folder.path(INDEX).exists());
+    let problem = written(&folder, &[Gaussians::zeros(0, 1)], division).unwrap_err();
     assert!(problem.to_string().contains("without Gaussians"), "{problem}");
 }
 
 #[test]
 fn the_command_writes_levels_and_refuses_options_of_other_formats() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = Folder::empty();
     let [model, _] = tiles();
-    let root = folder.path().display();
-    ply::save(&model, folder.path().join("a.ply")).unwrap();
+    let root = folder.display();
+    ply::save(&model, folder.path("a.ply")).unwrap();
     let line =
         succeed(&format!("export {root}/a.ply --format streamed-sog --levels 2 --chunk 160"));
     assert!(line.contains("2 levels of 300, 152 Gaussians in 3 chunks"), "{line}");
-    assert_eq!(
-        index(&folder.path().join("a.streamed-sog"))["counts"],
-        serde_json::json!([300, 152])
-    );
+    assert_eq!(index(&folder.path("a.streamed-sog"))["counts"], serde_json::json!([300, 152]));
 
     succeed(&format!("export {root}/a.ply --format ply --level 1 --chunk 160 --out {root}/b.ply"));
-    let half = ply::load(folder.path().join("b.ply")).unwrap();
+    let half = ply::load(folder.path("b.ply")).unwrap();
     assert_eq!(half, level(&model, &[model.count], 40, 1).with_sh_degree(3));
     for (options, part) in [
         ("--format sog --levels 2", "--level"),

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::common::command::succeed;
+use crate::common::command::{Folder, succeed};
 use crate::common::png::put_chunk;
 
 /// Exif that says: turn a quarter clockwise.
@@ -38,29 +38,29 @@ fn are_upright(page: &Path) {
 
 #[test]
 fn pages_and_event_files_show_photographs_and_renders_upright() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path().display();
+    let folder = Folder::empty();
+    let root = folder.display();
     succeed(&format!("synth {root}/set --views 9 --width 40 --height 32"));
     for part in ["low", "high"] {
-        for entry in fs::read_dir(folder.path().join("set").join(part)).unwrap() {
+        for entry in fs::read_dir(folder.path("set").join(part)).unwrap() {
             put_chunk(&entry.unwrap().path(), b"eXIf", TURNED);
         }
     }
     let options = "--plan none --curve ase --steps 4 --progress none";
     succeed(&format!("train {root}/set --out {root}/run --tensorboard --eval-every 2 {options}"));
-    let written = fs::read_dir(folder.path().join("run/tensorboard")).unwrap();
+    let written = fs::read_dir(folder.path("run/tensorboard")).unwrap();
     let events: Vec<u8> =
         written.flat_map(|entry| fs::read(entry.unwrap().path()).unwrap()).collect();
     let holds = |part: &[u8]| events.windows(part.len()).any(|bytes| bytes == part);
     assert!(holds(&header(32, 40)) && !holds(&header(40, 32)));
 
     succeed(&format!("eval {root}/run --report {root}/eval.html"));
-    are_upright(&folder.path().join("eval.html"));
+    are_upright(&folder.path("eval.html"));
     succeed(&format!("diagnose {root}/set --report {root}/diagnosis.html"));
-    let diagnosis = fs::read_to_string(folder.path().join("diagnosis.html")).unwrap();
+    let diagnosis = folder.text("diagnosis.html");
     assert!(
         diagnosis.contains("width=\"32\" height=\"40\"") && !diagnosis.contains("height=\"32\"")
     );
     succeed(&format!("sweep {root}/set --out {root}/sweep --curves ase --steps 4"));
-    are_upright(&folder.path().join("sweep/index.html"));
+    are_upright(&folder.path("sweep/index.html"));
 }

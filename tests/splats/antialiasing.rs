@@ -1,16 +1,10 @@
 //! The two filters against aliasing: compensated opacities, and the smoothing floor.
 
-use glam::{DVec2, Vec3};
-use nightsplat::gpu::testing::gpu;
-use nightsplat::reference::gaussian::Gaussian;
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::scene::Gaussians;
 use nightsplat::splats::smoothing::SmoothingFloor;
-use nightsplat::train::{TrainConfig, Trainer};
-use nightsplat_core::camera::Camera;
 
-use crate::common::setup::{Setup, fisheye};
-use crate::common::train::{advance, dataset};
+use crate::common::prelude::*;
+use crate::common::setup::fisheye;
+use crate::common::train::dataset;
 
 /// The light of one small splat in a view of 1/`shrink` of the size: the sum of one minus the transmittances, in pixels
 /// of the view of full size.
@@ -18,7 +12,7 @@ fn light(antialiased: bool, shrink: u32) -> f64 {
     let mut setup = Setup::new(1, [96 / shrink, 96 / shrink], 0, 1);
     let full = Setup::new(1, [96, 96], 0, 1);
     let gaussian = full.get(0);
-    let log_scale = glam::DVec3::splat((2.5 * 3.0 / (0.9 * 96.0_f64)).ln());
+    let log_scale = DVec3::splat((2.5 * 3.0 / (0.9 * 96.0_f64)).ln());
     let mean = full.at_pixel(DVec2::splat(48.0), 3.0);
     setup.set(0, &Gaussian { mean, log_scale, raw_opacity: -1.0, ..gaussian });
     setup.settings.antialiased = antialiased;

@@ -1,17 +1,12 @@
 //! More Gaussians than one binding can hold: passes in batches, with the same bits.
 
-use glam::{DVec3, Vec3};
-use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_with};
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
-use nightsplat::splats::scene::{Gaussians, Layout, Shape, width};
-use nightsplat::train::{TrainConfig, Trainer};
-use nightsplat_photographs::dataset::Dataset;
+use nightsplat::gpu::testing::gpu_that_binds;
+use nightsplat::splats::scene::width;
 
 use crate::common::not_run;
-use crate::common::setup::{Setup, features};
-use crate::common::train::{advance, dataset};
+use crate::common::prelude::*;
+use crate::common::setup::features;
+use crate::common::train::dataset;
 
 /// The planes of 2176 Gaussians of SH degree 3, or 16384 splats.
 const LITTLE: u64 = 1 << 19;
@@ -173,7 +168,7 @@ fn trains_to_the_bits_of_one_batch(little: &Gpu) {
     let end = |trainer: &mut Trainer| {
         let path = folder.path().join("end.safetensors");
         trainer.save_checkpoint(&path).unwrap();
-        std::fs::read(path).unwrap()
+        fs::read(path).unwrap()
     };
     assert!(end(&mut batched) == end(&mut expected), "another state");
 
@@ -205,7 +200,7 @@ fn training_as_on_a_gpu_gives_the_bits_of_training_as_on_a_cpu() {
         (config.precision.rest, config.precision.moments) = (rest, moments);
         let train = |gpu: &Gpu| {
             let mut trainer = Trainer::new(gpu, config.clone(), &dataset).unwrap();
-            advance(&mut trainer, 30);
+            advance(&mut trainer, 23);
             trainer.gaussians().unwrap()
         };
         let expected = train(&gpu());

@@ -3,14 +3,13 @@
 
 use std::f64::consts::TAU;
 
-use glam::{DMat2, DVec2, UVec2, Vec2};
-use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{Threads, Tile};
+use glam::DMat2;
+use nightsplat::gpu::Tile;
 use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::{ProjectedSplat, blend_backward, blend_forward};
 use nightsplat::reference::splat::{Splat, splat_level};
 
-use crate::common::Random;
+use crate::common::prelude::*;
 use crate::common::setup::tile_of;
 
 /// Tiles with their splats, front to back.
@@ -196,7 +195,7 @@ fn splat(mean: DVec2, [long, short]: [f64; 2], angle: f64, opacity: f64) -> Proj
     let half_extent = (splat_level(opacity as f32) * variances).map(f32::sqrt) + 0.01;
     ProjectedSplat {
         mean2d: mean.as_vec2(),
-        conic: glam::DVec3::new(conic.x_axis.x, conic.x_axis.y, conic.y_axis.y).as_vec3(),
+        conic: DVec3::new(conic.x_axis.x, conic.x_axis.y, conic.y_axis.y).as_vec3(),
         opacity: opacity as f32,
         half_extent,
     }

@@ -1,28 +1,15 @@
 //! The code that ships is the code that is checked: every pass of rendering, training, density control and pseudo-GT,
 //! as the library records it, against its CPU reference.
 
-use std::collections::BTreeSet;
-use std::path::Path;
-
-use glam::{DVec2, DVec3};
 use nightsplat::Error;
-use nightsplat::gpu::testing::{Defect, gpu, gpu_with, is_checked, with_defect};
-use nightsplat::gpu::{CheckReport, Gpu, Sorting};
-use nightsplat::networks::NetworkVariant;
-use nightsplat::reference::gaussian::Gaussian;
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::scene::{Features, Shape};
+use nightsplat::gpu::testing::{Defect, is_checked, with_defect};
+use nightsplat::gpu::{CheckReport, Sorting};
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
-use nightsplat::targets::pseudo_gt::PseudoGt;
-use nightsplat::train::{Background, Part, TrainConfig, Trainer};
-use nightsplat_core::random::Stream;
-use nightsplat_photographs::dataset::Dataset;
-use nightsplat_photographs::image::{Image, ImageFile};
-use nightsplat_photographs::tone::{Statistics, Tone, ToneCurve, ToneSettings};
+use nightsplat::train::{Background, Part};
+use nightsplat_photographs::tone::Tone;
 
-use crate::common::Random;
-use crate::common::setup::{Gradients, Setup, tile_of, variants};
-use crate::common::train::small_set;
+use crate::common::prelude::*;
+use crate::common::setup::{Gradients, tile_of, variants};
 
 /// Six views of 40 x 30 pixels with depth maps, as the model requires.
 fn dataset(config: &TrainConfig) -> Dataset {
@@ -30,9 +17,9 @@ fn dataset(config: &TrainConfig) -> Dataset {
     let options = small_set(6, [40, 30], 1);
     nightsplat_synth::write(folder.path(), &options).unwrap();
     let depth = folder.path().join("depth");
-    std::fs::create_dir(&depth).unwrap();
+    fs::create_dir(&depth).unwrap();
     let map = Image::from_fn(20, 15, |x, y| [1.0 - (y as f32 + 0.1 * x as f32) / 20.0; 3]);
-    for file in std::fs::read_dir(folder.path().join("low")).unwrap() {
+    for file in fs::read_dir(folder.path().join("low")).unwrap() {
         let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
         map.save_png16(depth.join(format!("depth_{name}.png"))).unwrap();
     }
@@ -181,7 +168,7 @@ fn a_checked_step_gives_the_bits_of_an_unchecked_one() {
     let bytes = |trainer: &mut Trainer, name: &str| {
         let path = folder.path().join(name);
         trainer.save_checkpoint(&path).unwrap();
-        std::fs::read(path).unwrap()
+        fs::read(path).unwrap()
     };
     assert!(bytes(&mut checked, "a") == bytes(&mut unchecked, "b"), "moments or networks differ");
 }

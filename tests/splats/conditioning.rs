@@ -3,21 +3,17 @@
 
 use std::ops::Range;
 
-use glam::{DVec2, DVec3};
-use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
 use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
-use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::reference::rounding::UNIT;
 use nightsplat::reference::splat::Splat;
 use nightsplat::splats::attributes::{AttributePlane, PlaneCounts, planes};
-use nightsplat::splats::optimizer::{Adam, AdamBuffers, AdamStep, LearningRates, Moments};
-use nightsplat_core::random::Stream;
-use nightsplat_photographs::tone::{Statistics, percentiles};
+use nightsplat::splats::optimizer::{Adam, AdamBuffers, AdamStep, LearningRates};
+use nightsplat_photographs::tone::percentiles;
 
-use crate::common::setup::Setup;
-use crate::common::{Random, widen};
+use crate::common::prelude::*;
+use crate::common::widen;
 
 /// Numbers in a record of three channels: six moments, colour.
 const RECORD: usize = 9;

@@ -1,11 +1,7 @@
 //! Gaussians that are rendered with those of a view, and have no gradients.
 
-use nightsplat::gpu::testing::gpu;
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::render::{RenderSettings, Renderer};
-use nightsplat::splats::scene::{Features, Gaussians};
-
-use crate::common::setup::{Rendered, Setup};
+use crate::common::prelude::*;
+use crate::common::setup::Rendered;
 
 const SIZE: [u32; 2] = [50, 37];
 

@@ -2,17 +2,14 @@
 
 use std::f64::consts::FRAC_PI_2;
 
-use glam::{DAffine3, DVec2, DVec3, DVec4};
-use nightsplat::gpu::testing::gpu;
+use glam::DVec4;
 use nightsplat::kernels;
 use nightsplat::reference::camera;
-use nightsplat::reference::gaussian::Gaussian;
-use nightsplat::splats::scene::Shape;
-use nightsplat_core::camera::{Camera, CameraModel, KannalaBrandt, Patch};
+use nightsplat_core::camera::{KannalaBrandt, Patch};
 
 use crate::common::chain::Chain;
-use crate::common::setup::{Rendered, Setup, features, fisheye};
-use crate::common::{Random, assert_close};
+use crate::common::prelude::*;
+use crate::common::setup::{Rendered, features, fisheye};
 
 const COEFFICIENTS: [[f64; 4]; 3] =
     [[0.0; 4], [0.05, -0.02, 0.006, -0.001], [-0.0124, 0.0044, -0.0031, 0.0005]];

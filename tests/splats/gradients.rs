@@ -1,18 +1,12 @@
 //! The backward pass: central differences of the f64 chain, the renderer against the chain, the same bits every time.
 
-use glam::{DVec2, DVec3};
-use nightsplat::gpu::testing::gpu;
 use nightsplat::reference;
 use nightsplat::reference::camera::ReferenceLens;
-use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::lamp::Lamp;
-use nightsplat::splats::scene::Shape;
-use nightsplat_core::camera::CameraModel;
 
 use crate::common::chain::Chain;
-use crate::common::setup::{
-    Gradients, Rendered, Setup, features, fisheye, lamp, tile_of, variants,
-};
+use crate::common::prelude::*;
+use crate::common::setup::{Gradients, Rendered, features, fisheye, lamp, tile_of, variants};
 
 const SIZE: [u32; 2] = [26, 19];
 

@@ -1,15 +1,13 @@
 //! Gaussians with what Adam needs of them.
 
-use glam::{DAffine3, DVec2};
-use nightsplat::gpu::{Buffer, Gpu, Recorder};
+use nightsplat::gpu::{Buffer, Recorder};
 use nightsplat::kernels;
 use nightsplat::splats::batches::Batches;
-use nightsplat::splats::optimizer::{
-    Adam, AdamBuffers, AdamStep, GaussianStep, LearningRates, Moments,
-};
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::scene::{DeviceGaussians, Layout, Shape};
-use nightsplat_core::camera::{Camera, CameraModel, Patch};
+use nightsplat::splats::optimizer::{Adam, AdamBuffers, AdamStep, GaussianStep, LearningRates};
+use nightsplat::splats::scene::DeviceGaussians;
+use nightsplat_core::camera::Patch;
+
+use crate::common::prelude::*;
 
 pub(crate) fn wave(len: usize, scale: f32, phase: f32) -> Vec<f32> {
     (0..len).map(|i| scale * (i as f32 * 0.7 + phase).sin()).collect()

@@ -1,16 +1,13 @@
 //! Levels of detail: how many Gaussians they have, what they keep, and how little they change images.
 
-use glam::{DAffine3, DMat3, DQuat, DVec3, Quat, Vec3};
-use nightsplat::gpu::testing::gpu;
+use glam::Quat;
 use nightsplat::reference::densify_scatter::{ChildGaussian as Split, half_of};
 use nightsplat::splats::levels::{Cells, coarser, level};
 use nightsplat::splats::model::Model;
-use nightsplat::splats::render::{RenderOptions, Renderer};
-use nightsplat::splats::scene::{Gaussians, rest_coefficients};
-use nightsplat_core::camera::Camera;
-use nightsplat_core::random::Stream;
-use nightsplat_photographs::image::Image;
+use nightsplat::splats::scene::rest_coefficients;
 use nightsplat_photographs::metrics::psnr;
+
+use crate::common::prelude::*;
 
 /// A cloud around the origin.
 fn cloud(count: usize, seed: u64) -> Gaussians {

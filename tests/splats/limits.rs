@@ -4,20 +4,17 @@
 use std::array;
 use std::collections::HashSet;
 
-use glam::{DVec2, DVec3, UVec2, Vec2, Vec3};
-use nightsplat::gpu::testing::{gpu, gpu_with};
-use nightsplat::gpu::{Threads, Tile};
+use nightsplat::gpu::Tile;
 use nightsplat::kernels::no_tile::NO_TILE;
 use nightsplat::kernels::status::STATUS_TILE_LIMIT;
 use nightsplat::kernels::{self, ProjectedSplat, emit, order_counts, project_backward};
-use nightsplat::reference::gaussian::Gaussian;
-use nightsplat::splats::render::{RenderSettings, Renderer, Status};
-use nightsplat::splats::scene::Shape;
+use nightsplat::splats::render::Status;
 use nightsplat_core::camera::Patch;
 
 use crate::blending::tile_runs;
-use crate::common::setup::{Setup, features};
-use crate::common::{Random, not_run};
+use crate::common::not_run;
+use crate::common::prelude::*;
+use crate::common::setup::features;
 
 /// The total and the status after `order_counts` for this much memory.
 fn counted(

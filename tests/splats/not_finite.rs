@@ -1,12 +1,12 @@
 //! NaN where none is allowed: it is caught in the step in which it arises, named, and changes nothing.
 
 use nightsplat::Error;
-use nightsplat::gpu::testing::{Defect, gpu, with_defect};
-use nightsplat::train::{NotFinite, TrainConfig, Trainer};
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::gpu::testing::{Defect, with_defect};
+use nightsplat::train::NotFinite;
 
-use crate::common::setup::{Rendered, Setup};
-use crate::common::train::{advance, dataset};
+use crate::common::prelude::*;
+use crate::common::setup::Rendered;
+use crate::common::train::dataset;
 
 /// The background of the render is NaN, and therefore the loss.
 const BAD_LOSS: Defect = Defect { kernel: "blend_forward", word: 4, bits: 0x7fc0_0000 };
@@ -61,8 +61,7 @@ fn a_view_with_not_finite_values_is_left_out_and_the_run_continues_to_the_same_b
         let checkpoint = folder.path().join("checkpoint.safetensors");
         trainer.save_checkpoint(&checkpoint).unwrap();
         let reports = advance(&mut trainer, 30);
-        let views: std::collections::BTreeSet<&str> =
-            reports.iter().map(|report| report.view.as_str()).collect();
+        let views: BTreeSet<&str> = reports.iter().map(|report| report.view.as_str()).collect();
         let all = dataset.train_views().count();
         assert_eq!(views.len(), all - 1, "{views:?}");
         let mut resumed = new();

@@ -1,13 +1,14 @@
 //! Adam: the kernel against its reference, its guards, and a minimisation.
 
-use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{Gpu, Reference};
+use nightsplat::gpu::{Buffer, Reference};
 use nightsplat::kernels::adam;
 use nightsplat::splats::attributes::Attribute;
 use nightsplat::splats::attributes::PlaneCounts;
 use nightsplat::splats::optimizer::{
-    Adam, AdamBuffers, AdamStep, FiniteCheck, LearningRates, Moments, Schedule,
+    Adam, AdamBuffers, AdamStep, FiniteCheck, LearningRates, Schedule,
 };
+
+use crate::common::prelude::*;
 
 /// Two features and SH of degree 1.
 const COLUMNS: u32 = 25;
@@ -47,38 +48,28 @@ impl Planes {
         }
     }
 
-    /// One step on the device.
-    fn step(
-        &mut self,
-        gpu: &Gpu,
-        step: u64,
-        [gaussian_count, column_count]: [u32; 2],
-        status: u32,
-    ) {
+    /// The parameters from the first, and what a step has of the columns from another float on.
+    fn upload(&self, gpu: &Gpu, trained: usize) -> OnDevice {
         let upload = |name: &str, data: &[f32]| gpu.buffer(name, data).unwrap();
-        let mut parameters = upload("parameters", &self.parameters);
-        let gradients = upload("gradients", &self.gradients);
-        let mut moments = Moments::Single {
-            first: upload("first", &self.first),
-            second: upload("second", &self.second),
-        };
+        let (first, second) = (upload("first", &self.first[trained..]), &self.second[trained..]);
+        OnDevice {
+            parameters: upload("parameters", &self.parameters),
+            gradients: upload("gradients", &self.gradients[trained..]),
+            moments: Moments::Single { first, second: upload("second", second) },
+        }
+    }
+
+    /// One step on the device.
+    fn step(&mut self, gpu: &Gpu, step: u64, columns: [u32; 2], status: u32) {
+        let mut on_device = self.upload(gpu, 0);
         let status = gpu.buffer("status", &[status]).unwrap();
         let adam = Adam::new(gpu).unwrap();
         gpu.run("adam", |pass| {
-            let buffers = AdamBuffers {
-                parameters: parameters.slice_mut(),
-                gradients: gradients.slice(),
-                moments: moments.slice_mut(),
-            };
-            let planes = planes([gaussian_count, column_count]);
             let step = AdamStep { step, rates: &RATES, status: &status };
-            adam.record(pass, step, planes, buffers)
+            adam.record(pass, step, planes(columns), on_device.buffers())
         })
         .unwrap();
-        self.parameters = gpu.read(&parameters).unwrap();
-        let Moments::Single { first, second } = &moments else { panic!("{moments:?}") };
-        self.first = gpu.read(first).unwrap();
-        self.second = gpu.read(second).unwrap();
+        [self.parameters, self.first, self.second] = on_device.read(gpu);
     }
 
     /// The same step in the reference.
@@ -108,6 +99,28 @@ impl Planes {
             .flatten()
             .map(|x| x.to_bits())
             .collect()
+    }
+}
+
+struct OnDevice {
+    parameters: Buffer<f32>,
+    gradients: Buffer<f32>,
+    moments: Moments,
+}
+
+impl OnDevice {
+    fn buffers(&mut self) -> AdamBuffers<'_> {
+        AdamBuffers {
+            parameters: self.parameters.slice_mut(),
+            gradients: self.gradients.slice(),
+            moments: self.moments.slice_mut(),
+        }
+    }
+
+    /// The parameters and both moments.
+    fn read(&self, gpu: &Gpu) -> [Vec<f32>; 3] {
+        let Moments::Single { first, second } = &self.moments else { panic!("{:?}", self.moments) };
+        [&self.parameters, first, second].map(|planes| gpu.read(planes).unwrap())
     }
 }
 
@@ -147,39 +160,27 @@ fn frozen_columns_have_no_moments_and_keep_their_parameters() {
         let adam = Adam::with_frozen(&gpu, frozen).unwrap();
         let before = Planes::new(gaussian_count);
         let begin = (frozen * gaussian_count) as usize;
-        let trained = begin / 4 * 4..;
-        let upload = |name: &str, data: &[f32]| gpu.buffer(name, data).unwrap();
-        let mut parameters = upload("parameters", &before.parameters);
-        let gradients = upload("gradients", &before.gradients[trained.clone()]);
-        let mut moments = Moments::Single {
-            first: upload("first", &before.first[trained.clone()]),
-            second: upload("second", &before.second[trained.clone()]),
-        };
+        let trained = begin / 4 * 4;
+        let mut on_device = before.upload(&gpu, trained);
         let planes = planes([gaussian_count, COLUMNS]);
         let (done, report) = gpu.checked(|| {
             gpu.run("adam", |pass| {
-                let buffers = AdamBuffers {
-                    parameters: parameters.slice_mut(),
-                    gradients: gradients.slice(),
-                    moments: moments.slice_mut(),
-                };
                 let step = AdamStep { step: 3, rates: &RATES, status: &status };
-                adam.record_trained(pass, step, planes, buffers)
+                adam.record_trained(pass, step, planes, on_device.buffers())
             })
         });
         done.unwrap();
         report.agree().unwrap();
         let mut expected = before.clone();
         expected.step(&gpu, 3, [gaussian_count, COLUMNS], 0);
-        let Moments::Single { first, second } = &moments else { panic!("{moments:?}") };
-        let [stepped, first, second] = [&parameters, first, second].map(|p| gpu.read(p).unwrap());
+        let [stepped, first, second] = on_device.read(&gpu);
         assert!(stepped[..begin] == before.parameters[..begin]);
         assert!(stepped[begin..] == expected.parameters[begin..]);
         let shared = begin % 4;
         assert!(first[shared..] == expected.first[begin..]);
         assert!(second[shared..] == expected.second[begin..]);
         // Those of frozen parameters in the first vector.
-        assert!(first[..shared] == before.first[trained][..shared]);
+        assert!(first[..shared] == before.first[trained..][..shared]);
     }
 }
 
@@ -299,19 +300,16 @@ fn a_buffer_that_is_too_short_is_refused() {
         ([28; 3], 0, 1),
         ([28; 3], 1, 0),
     ] {
-        let mut parameters = gpu.zeros("parameters", lengths[0]).unwrap();
-        let gradients = gpu.zeros("gradients", lengths[1]).unwrap();
-        let mut moments = Moments::zeros(&gpu, lengths[2]).unwrap();
+        let mut on_device = OnDevice {
+            parameters: gpu.zeros("parameters", lengths[0]).unwrap(),
+            gradients: gpu.zeros("gradients", lengths[1]).unwrap(),
+            moments: Moments::zeros(&gpu, lengths[2]).unwrap(),
+        };
         let status = gpu.zeros("status", status_len).unwrap();
         let rates = Schedule::default().learning_rates(step, 1.0);
         let result = gpu.run("adam", |pass| {
-            let buffers = AdamBuffers {
-                parameters: parameters.slice_mut(),
-                gradients: gradients.slice(),
-                moments: moments.slice_mut(),
-            };
             let step = AdamStep { step, rates: &rates, status: &status };
-            adam.record(pass, step, PLANES, buffers)
+            adam.record(pass, step, PLANES, on_device.buffers())
         });
         assert!(result.is_err(), "{lengths:?} {status_len} {step}");
     }

@@ -1,25 +1,21 @@
 //! The renderer's forward pass: its limits, its invariances, and golden renders.
 
 use std::collections::HashSet;
-use std::path::Path;
 
-use glam::{DAffine3, DMat3, DVec2, DVec3, DVec4, Vec2, Vec3};
-use nightsplat::gpu::testing::gpu;
+use glam::DVec4;
 use nightsplat::gpu::{Sorting, Tile};
 use nightsplat::kernels::ProjectedSplat;
 use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
-use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::reference::splat::{Splat, splat_columns};
 use nightsplat::splats::lamp::Lamp;
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::render::{RenderSettings, Renderer, Status};
-use nightsplat::splats::scene::{Attribute, Features, Gaussians, Shape};
-use nightsplat_core::camera::Camera;
+use nightsplat::splats::render::Status;
+use nightsplat::splats::scene::Attribute;
 
 use crate::common::chain::Chain;
-use crate::common::setup::{Rendered, Setup, features, lamp, tile_of};
-use crate::common::{Random, assert_close, fixture, safetensors, shared};
+use crate::common::prelude::*;
+use crate::common::setup::{Rendered, features, lamp, tile_of};
+use crate::common::{fixture, safetensors};
 
 const SIZE: [u32; 2] = [50, 40];
 

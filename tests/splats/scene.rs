@@ -1,14 +1,12 @@
 //! Gaussians on the host: their table, their initialisation, their file.
 
-use glam::{DAffine3, DVec2, DVec3, Quat, Vec3};
+use glam::Quat;
 use nightsplat::splats::attributes::planes;
 use nightsplat::splats::scene::init::Initialization;
-use nightsplat::splats::scene::{
-    ATTRIBUTES, Features, Gaussians, SH_C0, Shape, init, ply, rest_coefficients, width,
-};
-use nightsplat_core::camera::{Camera, CameraModel};
-use nightsplat_photographs::dataset::{Point, Split, View};
-use nightsplat_photographs::image::Image;
+use nightsplat::splats::scene::{ATTRIBUTES, SH_C0, init, rest_coefficients, width};
+use nightsplat_photographs::dataset::{Point, View};
+
+use crate::common::prelude::*;
 
 /// A camera at `position` that looks along +z.
 fn camera(position: DVec3) -> Camera {
@@ -352,14 +350,14 @@ mod ply_file {
     fn problem(bytes: &[u8]) -> String {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("model.ply");
-        std::fs::write(&path, bytes).unwrap();
+        fs::write(&path, bytes).unwrap();
         ply::load(&path).unwrap_err().to_string()
     }
 
     fn bytes(gaussians: &Gaussians) -> Vec<u8> {
         let dir = tempfile::tempdir().unwrap();
         ply::save(gaussians, dir.path().join("model.ply")).unwrap();
-        std::fs::read(dir.path().join("model.ply")).unwrap()
+        fs::read(dir.path().join("model.ply")).unwrap()
     }
 
     #[test]
@@ -397,7 +395,7 @@ mod ply_file {
                 assert_eq!(ply::load(&path).unwrap(), gaussians, "degree {sh_degree}, {count}");
             }
         }
-        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "a temporary file is left");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1, "a temporary file is left");
     }
 
     #[test]
@@ -450,7 +448,7 @@ mod ply_file {
         extended.extend([3, 0, 0, 0, 0]);
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("model.ply");
-        std::fs::write(&path, extended).unwrap();
+        fs::write(&path, extended).unwrap();
         assert_eq!(ply::load(&path).unwrap(), gaussians);
     }
 
@@ -509,8 +507,8 @@ mod ply_file {
         assert!(problem.to_string().contains("missing"), "{problem}");
         let problem = ply::load(path("model.ply")).unwrap_err();
         assert!(problem.to_string().contains("model.ply"), "{problem}");
-        std::fs::create_dir(dir.path().join("taken")).unwrap();
+        fs::create_dir(dir.path().join("taken")).unwrap();
         assert!(ply::save(&distinct(1, 0), dir.path().join("taken")).is_err());
-        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "a temporary file is left");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1, "a temporary file is left");
     }
 }

@@ -1,11 +1,12 @@
 //! Scan and radix sort: each kernel against its reference, the whole against the standard library.
 
-use nightsplat::gpu::testing::{gpu, gpu_with};
-use nightsplat::gpu::{Buffer, Gpu, Threads};
+use nightsplat::gpu::Buffer;
 use nightsplat::kernels::digit::MAX_DIGITS;
 use nightsplat::kernels::no_tile::NO_TILE;
 use nightsplat::kernels::{scan_downsweep, scan_upsweep, sort_downsweep, sort_upsweep};
 use nightsplat::splats::sort::{Count, RadixSort, Scan, TileSort, UnsortedTiles};
+
+use crate::common::prelude::*;
 
 const PARTITION: u32 = 1024;
 const SIZES: [u32; 8] =

@@ -1,12 +1,9 @@
 //! Adam over whole Gaussians: its guards, in every format.
 
-use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::splats::attributes::Attribute;
-use nightsplat::splats::optimizer::{LearningRates, Moments};
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::scene::{Layout, Shape};
+use nightsplat::splats::optimizer::LearningRates;
 
+use crate::common::prelude::*;
 use crate::common::setup::features;
 use crate::learned::Learned;
 

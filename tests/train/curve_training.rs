@@ -1,18 +1,11 @@
 //! Training with every kind of curve: evaluated in the loss, baked at upload, fitted to the scene; and from a run's
 //! recorded configuration.
 
-use nightsplat::gpu::testing::gpu;
-use nightsplat::targets::pseudo_gt::PseudoGt;
-use nightsplat::train::{TrainConfig, Trainer};
-use nightsplat_photographs::dataset::{Dataset, LoadOptions};
-use nightsplat_photographs::image::{Image, ImageFile};
+use nightsplat_photographs::dataset::LoadOptions;
 use nightsplat_photographs::scene_tone::{SceneTone, TargetExposure};
-use nightsplat_photographs::tone::{
-    GainChoice, MeasuredPhotograph, Table, Tone, ToneCurve, ToneSettings,
-};
-use nightsplat_synth::SyntheticOptions;
+use nightsplat_photographs::tone::{GainChoice, MeasuredPhotograph, Table, Tone};
 
-use crate::common::train::small_set;
+use crate::common::prelude::*;
 
 /// The losses of the first steps and the resulting parameters.
 fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<f64>, Vec<f32>) {

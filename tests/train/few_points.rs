@@ -1,16 +1,10 @@
 //! Datasets with few points: random points are added, and Gaussians at the depths that the first steps found.
 
-use std::fs;
+use nightsplat::train::{DensityConfig, Part};
+use nightsplat_photographs::image::Mask;
 
-use glam::DVec3;
-use nightsplat::gpu::testing::gpu;
-use nightsplat::splats::scene::Gaussians;
-use nightsplat::train::{DensityConfig, Part, TrainConfig, Trainer};
-use nightsplat_photographs::dataset::Dataset;
-use nightsplat_photographs::image::{Image, Mask};
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
-
-use crate::common::train::{advance, train};
+use crate::common::prelude::*;
+use crate::common::train::train;
 
 /// All points, which are on the surfaces, and a dataset with `points` of them.
 fn dataset(points: usize) -> (Vec<DVec3>, Dataset) {

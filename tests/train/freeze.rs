@@ -1,19 +1,13 @@
 //! Frozen attributes: other colours on given geometry.
 
-use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::{gpu, gpu_with};
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::scene::Gaussians;
-use nightsplat::train::{TrainConfig, Trainer};
-use nightsplat_photographs::dataset::{Dataset, Split};
-
 use crate::common::log::warnings;
-use crate::common::train::{advance, dataset, train};
+use crate::common::prelude::*;
+use crate::common::train::{dataset, train};
 
 const GEOMETRY: &str = "means,quats,scales,opacities";
 
 /// A model of a few steps, as a file.
-fn day(folder: &tempfile::TempDir) -> (std::path::PathBuf, Gaussians) {
+fn day(folder: &tempfile::TempDir) -> (PathBuf, Gaussians) {
     let (_, gaussians) =
         train(&TrainConfig { steps: 30, ..TrainConfig::bare() }, &dataset(6, [40, 30]));
     let path = folder.path().join("day.ply");
@@ -21,7 +15,7 @@ fn day(folder: &tempfile::TempDir) -> (std::path::PathBuf, Gaussians) {
     (path, gaussians)
 }
 
-fn config(init: std::path::PathBuf, freeze: &str) -> TrainConfig {
+fn config(init: PathBuf, freeze: &str) -> TrainConfig {
     let mut config = TrainConfig {
         steps: 40,
         init: Some(init),
@@ -66,7 +60,7 @@ fn frozen_geometry_keeps_its_bits_and_colours_learn_on_any_device() {
             assert!(before.dc() != after.dc() && before.rest() != after.rest());
             assert!(loss(24..39) < loss(0..15), "{} {}", loss(24..39), loss(0..15));
             let gradients = trainer.gradients().unwrap();
-            assert!(gradients.means().iter().all(|mean| *mean == glam::Vec3::ZERO), "not written");
+            assert!(gradients.means().iter().all(|mean| *mean == Vec3::ZERO), "not written");
         }
     }
 }
@@ -131,7 +125,7 @@ fn a_model_of_another_world_is_warned_of_with_the_count() {
     let folder = tempfile::tempdir().unwrap();
     let (path, mut day) = day(&folder);
     let dataset = dataset(6, [40, 30]);
-    let new = |path: std::path::PathBuf| {
+    let new = |path: PathBuf| {
         warnings(|| drop(Trainer::new(&gpu(), config(path, GEOMETRY), &dataset).unwrap()))
     };
     assert!(!new(path).contains("out of sight"));

@@ -1,22 +1,16 @@
 //! Holes that black hides: a dark object in a dark room needs no Gaussians over a black background.
 
-use std::fs;
-use std::path::Path;
-
-use glam::DVec3;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::results::eval::{
     self, MAX_RESIDUAL_TRANSMITTANCE, Metric, ModelRenderer, ResidualTransmittance,
 };
-use nightsplat::train::{Background, Part, TrainConfig, Trainer};
-use nightsplat_photographs::dataset::{Dataset, View};
-use nightsplat_photographs::image::{Image, ImageFile, Mask};
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat_synth::{Capture, Night, SyntheticOptions};
-use serde_json::Value;
+use nightsplat::train::{Background, Part};
+use nightsplat_photographs::dataset::View;
+use nightsplat_photographs::image::Mask;
+use nightsplat_synth::Night;
 
 use crate::common::command::{self, succeed, unwrapped};
-use crate::common::train::{advance, train};
+use crate::common::prelude::*;
+use crate::common::train::train;
 
 const SET: SyntheticOptions = SyntheticOptions {
     views: 12,

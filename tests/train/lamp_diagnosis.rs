@@ -1,15 +1,11 @@
 //! A lamp that moves with the camera is told apart from everything else that makes a point differ between its views.
 
-use std::fs;
-use std::path::Path;
-
-use nightsplat::train::TrainConfig;
 use nightsplat::train::diagnose::{Diagnosis, LampDiagnosis, Plan, SceneDiagnosis};
-use nightsplat_photographs::dataset::{Dataset, LoadOptions};
-use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
-use nightsplat_synth::{Capture, SyntheticOptions};
+use nightsplat_photographs::dataset::LoadOptions;
+use nightsplat_photographs::image::srgb_from_linear;
 
-use crate::common::command::{succeed, unwrapped};
+use crate::common::command::{says, succeed, unwrapped};
+use crate::common::prelude::*;
 
 /// Of a room.
 fn set(lamp: Option<f64>) -> SyntheticOptions {
@@ -137,7 +133,7 @@ fn clipped_photographs_few_views_and_one_position_measure_no_lamp() {
     let folder = written(&set(Some(16.0)), &Capture::default());
     let path = folder.path().join("transforms_train.json");
     let whole = fs::read(&path).unwrap();
-    let list = || -> serde_json::Value { serde_json::from_slice(&whole).unwrap() };
+    let list = || -> Value { serde_json::from_slice(&whole).unwrap() };
 
     let mut fewer = list();
     fewer["frames"].as_array_mut().unwrap().truncate(4);
@@ -234,12 +230,9 @@ fn the_command_reports_the_lamp_as_text_json_and_page() {
     assert!(text.lines().any(|line| line.starts_with("lamp ") && line.contains(" on ")), "{text}");
     assert!(text.lines().next().unwrap().contains("lit by a lamp"), "{text}");
     let whole = unwrapped(&text);
-    for part in ["moves with the camera", "exponent", "beyond exposures", "by distance"] {
-        assert!(whole.contains(part), "{text}");
-    }
+    says(&whole, &["moves with the camera", "exponent", "beyond exposures", "by distance"]);
     assert!(fs::read_to_string(page).unwrap().contains("moves with the camera"));
-    let json: serde_json::Value =
-        serde_json::from_str(&succeed(&format!("diagnose {root} --json"))).unwrap();
+    let json: Value = serde_json::from_str(&succeed(&format!("diagnose {root} --json"))).unwrap();
     let lamp = &json["scene"]["lamp"];
     for key in ["exponent", "ambient", "d_ref", "r_squared", "stops", "exposure_r_squared"] {
         assert!(lamp[key].is_f64(), "{key} of {lamp}");

@@ -1,20 +1,13 @@
 //! The parts of LITA-GS: each alone and all together, trained, saved, and rendered.
 
-use std::path::Path;
-
-use nightsplat::gpu::testing::gpu;
 use nightsplat::loss::Term;
-use nightsplat::networks::{DenoiserSettings, NetworkVariant};
 use nightsplat::splats::attributes::{ATTRIBUTES, Attribute, AttributeSpec};
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::Gaussians;
-use nightsplat::train::{Part, Rendered, StepReport, TrainConfig, Trainer};
-use nightsplat_photographs::dataset::Dataset;
-use nightsplat_photographs::image::{Image, ImageFile};
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::train::{Part, Rendered, StepReport};
 
-use crate::common::command::{refused, succeed};
-use crate::common::train::{small_set, train};
+use crate::common::command::{Folder, json, says};
+use crate::common::prelude::*;
+use crate::common::train::train;
 
 /// Six views of 40 x 30 pixels, with depth maps if requested.
 fn make_set(folder: &Path, with_depth: bool) {
@@ -22,10 +15,10 @@ fn make_set(folder: &Path, with_depth: bool) {
     nightsplat_synth::write(folder, &options).unwrap();
     if with_depth {
         let depth = folder.join("depth");
-        std::fs::create_dir(&depth).unwrap();
+        fs::create_dir(&depth).unwrap();
         // Half the size, as estimators return it; a plane that recedes upwards.
         let map = Image::from_fn(20, 15, |x, y| [1.0 - (y as f32 + 0.1 * x as f32) / 20.0; 3]);
-        for file in std::fs::read_dir(folder.join("low")).unwrap() {
+        for file in fs::read_dir(folder.join("low")).unwrap() {
             let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
             map.save_png16(depth.join(format!("depth_{name}.png"))).unwrap();
         }
@@ -51,6 +44,24 @@ fn load(folder: &Path, config: &TrainConfig) -> Dataset {
     Dataset::load(folder, &config.load_options()).unwrap()
 }
 
+/// The set without depth maps, made once.
+fn plain_set(config: &TrainConfig) -> Dataset {
+    static SET: OnceLock<Folder> = OnceLock::new();
+    load(SET.get_or_init(|| folder(false)), config)
+}
+
+/// The set with depth maps, made once.
+fn deep_set(config: &TrainConfig) -> Dataset {
+    static SET: OnceLock<Folder> = OnceLock::new();
+    load(SET.get_or_init(|| folder(true)), config)
+}
+
+fn folder(with_depth: bool) -> Folder {
+    let folder = Folder::empty();
+    make_set(&folder, with_depth);
+    folder
+}
+
 /// The mean of a term over the first and over the last epoch.
 fn fall(reports: &[StepReport], term: Term) -> [f64; 2] {
     let mean = |reports: &[StepReport]| {
@@ -61,8 +72,6 @@ fn fall(reports: &[StepReport], term: Term) -> [f64; 2] {
 
 #[test]
 fn each_part_alone_has_its_channels_and_its_terms_fall() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), true);
     for (part, channels, terms) in [
         (Part::Structure, 4, &[Term::STRUCTURE][..]),
         (Part::Depth, 4, &[Term::DEPTH, Term::DEPTH_LOCAL]),
@@ -70,7 +79,7 @@ fn each_part_alone_has_its_channels_and_its_terms_fall() {
         (Part::Denoiser, 3, &[Term::DENOISING]),
     ] {
         let config = config(&[part]);
-        let (reports, gaussians) = train(&config, &load(folder.path(), &config));
+        let (reports, gaussians) = train(&config, &deep_set(&config));
         assert_eq!(gaussians.shape.features.channels(), channels);
         for &term in terms {
             let [begin, end] = fall(&reports, term);
@@ -93,10 +102,8 @@ fn paper(parts: &[Part]) -> TrainConfig {
 
 #[test]
 fn the_paper_s_denoiser_has_a_noise_map_and_its_terms_fall() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), false);
     let config = paper(&[Part::Denoiser]);
-    let (reports, gaussians) = train(&config, &load(folder.path(), &config));
+    let (reports, gaussians) = train(&config, &plain_set(&config));
     assert_eq!(gaussians.shape.features.channels(), 6);
     for term in [Term::DENOISING, Term::L1] {
         let [begin, end] = fall(&reports, term);
@@ -114,9 +121,7 @@ fn first_render(config: &TrainConfig, dataset: &Dataset) -> Rendered {
 
 #[test]
 fn with_every_part_of_the_paper_a_model_starts_as_the_plain_one_bit_for_bit() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), true);
-    let dataset = load(folder.path(), &config(&Part::LITA));
+    let dataset = deep_set(&config(&Part::LITA));
     let plain = first_render(&config(&[]), &dataset).colors;
     for parts in Part::LITA.iter().map(std::slice::from_ref).chain([&Part::LITA[..]]) {
         let begun = first_render(&config(parts), &dataset);
@@ -128,10 +133,8 @@ fn with_every_part_of_the_paper_a_model_starts_as_the_plain_one_bit_for_bit() {
 
 #[test]
 fn a_denoiser_that_learns_does_not_change_any_gaussian() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), false);
     let plain = config(&[]);
-    let dataset = load(folder.path(), &plain);
+    let dataset = plain_set(&plain);
     let expected = train(&plain, &dataset).1;
     for crop in [0, 12] {
         let mut config = config(&[Part::Denoiser]);
@@ -145,11 +148,9 @@ fn a_denoiser_that_learns_does_not_change_any_gaussian() {
 /// The tonemapper starts with the illumination of the dark photographs, so its loss starts small.
 #[test]
 fn the_illumination_is_initialised_from_the_photographs_and_their_targets() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), false);
     let first = |config: &TrainConfig| {
         let config = TrainConfig { steps: 1, ..config.clone() };
-        train(&config, &load(folder.path(), &config)).0[0].term(Term::LOW_L1)
+        train(&config, &plain_set(&config)).0[0].term(Term::LOW_L1)
     };
     let parts = [Part::Tonemapper];
     let (of_targets, of_paper) = (first(&config(&parts)), first(&paper(&parts)));
@@ -158,11 +159,9 @@ fn the_illumination_is_initialised_from_the_photographs_and_their_targets() {
 
 #[test]
 fn the_whole_model_gives_the_same_bits_every_time_on_crops_too() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), true);
     let mut config = TrainConfig { steps: 20, ..paper(&Part::ALL) };
     config.model.denoiser_crop = 12;
-    let dataset = load(folder.path(), &config);
+    let dataset = deep_set(&config);
     let (reports, gaussians) = train(&config, &dataset);
     assert_eq!(gaussians.shape.features.channels(), 11);
     assert!(reports.iter().all(|report| report.loss.is_finite() && report.terms.len() == 9));
@@ -174,13 +173,11 @@ fn the_whole_model_gives_the_same_bits_every_time_on_crops_too() {
 /// A crop that covers the view is the view: the estimate becomes the mean itself.
 #[test]
 fn a_crop_of_the_whole_view_changes_nothing() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), false);
     let parts = [Part::Denoiser, Part::Tonemapper];
     let whole = TrainConfig { steps: 6, ..config(&parts) };
     let mut cropped = whole.clone();
     cropped.model.denoiser_crop = 40;
-    let dataset = load(folder.path(), &whole);
+    let dataset = plain_set(&whole);
     assert_eq!(train(&whole, &dataset).1, train(&cropped, &dataset).1);
 }
 
@@ -189,8 +186,6 @@ fn a_crop_of_the_whole_view_changes_nothing() {
 #[test]
 fn crops_estimate_the_losses_of_the_whole_view() {
     const NO_RATE: f64 = 1e-12;
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), false);
     let losses = |crop: u32| -> Vec<f64> {
         let mut config = TrainConfig { steps: 48, ..config(&[Part::Tonemapper]) };
         config.schedule.densify_after = config.steps;
@@ -200,7 +195,7 @@ fn crops_estimate_the_losses_of_the_whole_view() {
         config.schedule.final_means_rate = NO_RATE;
         config.model.rates.tonemapper = NO_RATE;
         config.model.denoiser_crop = crop;
-        let (reports, _) = train(&config, &load(folder.path(), &config));
+        let (reports, _) = train(&config, &plain_set(&config));
         reports.iter().map(|report| report.term(Term::LOW_L1)).collect()
     };
     let (cropped, whole) = (losses(16), losses(0));
@@ -214,10 +209,9 @@ fn crops_estimate_the_losses_of_the_whole_view() {
 
 #[test]
 fn depth_maps_are_found_resized_negated_and_left_out_if_they_are_constant() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), true);
+    let folder = folder(true);
     let mut config = config(&[Part::Depth]);
-    let dataset = load(folder.path(), &config);
+    let dataset = load(&folder, &config);
     let views: Vec<_> = dataset.train_views().collect();
     assert!(dataset.test_views().all(|view| view.depth.is_none()));
     let depth = views[0].depth.as_ref().unwrap();
@@ -225,15 +219,15 @@ fn depth_maps_are_found_resized_negated_and_left_out_if_they_are_constant() {
     assert!(depth[0] > depth[39 + 40 * 29], "larger is farther");
 
     config.model.depth_is_disparity = true;
-    let negated = load(folder.path(), &config);
+    let negated = load(&folder, &config);
     let negated = negated.train_views().next().unwrap().depth.clone().unwrap();
     assert!(depth.iter().zip(&negated).all(|(a, b)| *a == -b));
     config.model.depth_is_disparity = false;
 
     let name = &views[0].name;
     let constant = Image::filled(40, 30, [0.5; 3]);
-    constant.save_png8(folder.path().join(format!("depth/depth_{name}.png"))).unwrap();
-    let dataset = load(folder.path(), &config);
+    constant.save_png8(folder.join(format!("depth/depth_{name}.png"))).unwrap();
+    let dataset = load(&folder, &config);
     let with_depth = dataset.train_views().filter(|view| view.depth.is_some()).count();
     assert_eq!(with_depth, views.len() - 1);
     // Training works: the view without depth omits the term.
@@ -242,51 +236,47 @@ fn depth_maps_are_found_resized_negated_and_left_out_if_they_are_constant() {
         assert_eq!((report.term(Term::DEPTH) == 0.0), report.view == *name, "{report:?}");
     }
 
-    config.model.depth_folder = Some(folder.path().join("nowhere"));
-    let error = Dataset::load(folder.path(), &config.load_options()).unwrap_err().to_string();
+    config.model.depth_folder = Some(folder.join("nowhere"));
+    let error = Dataset::load(&folder, &config.load_options()).unwrap_err().to_string();
     assert!(error.contains("nowhere") && error.contains("depth"), "{error}");
 }
 
 #[test]
 fn float_depth_keeps_its_values_and_its_sign() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), false);
-    let maps = folder.path().join("estimates");
-    std::fs::create_dir(&maps).unwrap();
+    let folder = folder(false);
+    let maps = folder.join("estimates");
+    fs::create_dir(&maps).unwrap();
     let map = Image::from_fn(40, 30, |x, _| [x as f32 - 20.0; 3]);
-    for file in std::fs::read_dir(folder.path().join("low")).unwrap() {
+    for file in fs::read_dir(folder.join("low")).unwrap() {
         let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
         map.save_exr_as_stored(maps.join(format!("{name}.exr"))).unwrap();
     }
     let mut config = config(&[Part::Depth]);
     config.model.depth_folder = Some(maps);
-    let dataset = load(folder.path(), &config);
+    let dataset = load(&folder, &config);
     let depth = dataset.train_views().next().unwrap().depth.clone().unwrap();
     assert_eq!((depth[0], depth[39]), (-20.0, 19.0));
 }
 
 #[test]
 fn without_depth_maps_there_is_no_depth_part() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), false);
     let config = TrainConfig { steps: 2, ..config(&[Part::Depth, Part::Structure]) };
-    let (reports, gaussians) = train(&config, &load(folder.path(), &config));
+    let (reports, gaussians) = train(&config, &plain_set(&config));
     assert_eq!(gaussians.shape.features.channels(), 4);
     assert_eq!(reports[0].terms.len(), 3);
 }
 
 #[test]
 fn raw_colors_train_and_are_saved_as_viewers_show_them() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path(), false);
+    let folder = folder(false);
     let mut config = TrainConfig { steps: 20, ..config(&[]) };
     config.model.raw_colors = true;
-    let (reports, gaussians) = train(&config, &load(folder.path(), &config));
+    let (reports, gaussians) = train(&config, &load(&folder, &config));
     let [begin, end] = fall(&reports, Term::L1);
     assert!(end < begin, "L1 went from {begin} to {end}");
     let before = gaussians.dc()[0].x;
     let model = Model { raw_colors: true, ..Model::from(gaussians) };
-    let path = folder.path().join("raw.ply");
+    let path = folder.join("raw.ply");
     model.save(&path).unwrap();
     let shown = Gaussians::open(&path).unwrap().dc()[0].x;
     assert!((shown - (before - 0.5 / 0.282_094_8)).abs() < 1e-5);
@@ -301,26 +291,24 @@ fn raw_colors_train_and_are_saved_as_viewers_show_them() {
 const SMALL: &str =
     "--steps 12 --sh-degree 0 --denoiser-channels 4 --denoiser-stages 1 --denoiser-repeats 2";
 
+/// A folder with the set in `set`.
+fn with_set(with_depth: bool) -> Folder {
+    let folder = Folder::empty();
+    make_set(&folder.path("set"), with_depth);
+    folder
+}
+
 #[test]
 fn a_run_with_networks_is_saved_scored_and_rendered_layer_by_layer() {
-    let folder = tempfile::tempdir().unwrap();
-    let set = folder.path().join("set");
-    make_set(&set, true);
-    let (set, run) = (set.display(), folder.path().join("run"));
-    let at = run.display();
+    let folder = with_set(true);
     let paper = "--preset lom --model lita --denoiser-crop 16";
-    succeed(&format!("train {set} --out {at} {paper} {SMALL}"));
-    let header = std::fs::read_to_string(run.join("train.csv")).unwrap();
+    folder.succeed(&format!("train @set --out @run {paper} {SMALL}"));
     let columns = "step,view,loss,l1,ssim,low_l1,low_ssim,structure,depth,depth_local,denoising,\
                    total_variation,gaussians,milliseconds";
-    assert_eq!(header.lines().next().unwrap(), columns);
-    let read = |path: &Path| -> serde_json::Value {
-        serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
-    };
-    let trained = read(&run.join("metrics.json"));
+    assert_eq!(folder.text("run/train.csv").lines().next().unwrap(), columns);
+    let trained = folder.json("run/metrics.json");
     assert!(trained["mean"]["r0"]["psnr"].as_f64().unwrap() > 0.0, "{trained}");
-    let scored: serde_json::Value =
-        serde_json::from_str(&succeed(&format!("eval {at} --json"))).unwrap();
+    let scored = json(folder.succeed("eval @run --json"));
     assert_eq!(scored["views"], trained["views"], "the saved networks are those that were trained");
 
     for (layer, format) in [
@@ -333,99 +321,69 @@ fn a_run_with_networks_is_saved_scored_and_rendered_layer_by_layer() {
         ("illumination", "png"),
         ("noise", "exr"),
     ] {
-        let out = folder.path().join(layer);
-        let to = out.display();
-        succeed(&format!("render {at} --split test --out {to} --layer {layer} --format {format}"));
-        let file = std::fs::read_dir(&out).unwrap().next().unwrap().unwrap().path();
+        let options = format!("--split test --out @{layer} --layer {layer} --format {format}");
+        folder.succeed(&format!("render @run {options}"));
+        let file = fs::read_dir(folder.path(layer)).unwrap().next().unwrap().unwrap().path();
         assert_eq!(Image::size_of(file).unwrap(), (40, 30), "{layer}");
     }
 
     // Networks of another configuration.
-    let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
-    std::fs::write(run.join("config.toml"), config.replace("channels = 4", "channels = 5"))
-        .unwrap();
-    refused(&format!("eval {at}"), 3, &["networks.safetensors", "\"channels\":4"]);
+    let config = folder.text("run/config.toml");
+    folder.write("run/config.toml", config.replace("channels = 4", "channels = 5"));
+    folder.refused("eval @run", 3, &["networks.safetensors", "\"channels\":4"]);
 }
 
 #[test]
 fn a_missing_layer_is_named_with_the_available_ones() {
-    let folder = tempfile::tempdir().unwrap();
-    let set = folder.path().join("set");
-    make_set(&set, false);
-    let (set, run) = (set.display(), folder.path().join("run"));
-    let at = run.display();
-    succeed(&format!("train {set} --out {at} --parts structure {SMALL}"));
-    let render = format!("render {at} --split test --out {at}/out --layer denoised");
-    refused(&render, 2, &["no denoised", "it has rgb, depth, normal", "transmittance, structure"]);
+    let folder = with_set(false);
+    folder.succeed(&format!("train @set --out @run --parts structure {SMALL}"));
+    let parts = ["no denoised", "it has rgb, depth, normal", "transmittance, structure"];
+    folder.refused("render @run --split test --out @out --layer denoised", 2, &parts);
 
-    let config = run.join("config.toml");
-    let text = std::fs::read_to_string(&config).unwrap();
-    let with_denoiser = text.replace("denoiser = false", "denoiser = true");
-    std::fs::write(&config, &with_denoiser).unwrap();
-    refused(&format!("eval {at}"), 3, &["networks.safetensors"]);
-    let of_paper = with_denoiser.replace("variant = \"identity\"", "variant = \"paper\"");
-    std::fs::write(&config, of_paper).unwrap();
-    refused(&format!("eval {at}"), 2, &["no noise, which the denoiser requires"]);
+    let config = "run/config.toml";
+    let with_denoiser = folder.text(config).replace("denoiser = false", "denoiser = true");
+    folder.write(config, &with_denoiser);
+    folder.refused("eval @run", 3, &["networks.safetensors"]);
+    folder.write(config, with_denoiser.replace("variant = \"identity\"", "variant = \"paper\""));
+    folder.refused("eval @run", 2, &["no noise, which the denoiser requires"]);
 }
 
 /// Without depth maps there is no depth channel, so the other channels are at other positions than the configuration
 /// implies.
 #[test]
 fn a_model_configured_with_unavailable_depth_scores_the_same_when_reloaded() {
-    let folder = tempfile::tempdir().unwrap();
-    let (set, run) = (folder.path().join("set"), folder.path().join("run"));
-    make_set(&set, false);
-    let (set, at) = (set.display(), run.display());
-    succeed(&format!("train {set} --out {at} --model lita {SMALL}"));
-    let trained = std::fs::read_to_string(run.join("metrics.json")).unwrap();
-    let [trained, scored] = [trained, succeed(&format!("eval {at} --json"))]
-        .map(|text| serde_json::from_str::<serde_json::Value>(&text).unwrap()["mean"].clone());
+    let folder = with_set(false);
+    folder.succeed(&format!("train @set --out @run --model lita {SMALL}"));
+    let trained = &folder.json("run/metrics.json")["mean"];
     assert!(trained["r0"]["psnr"].is_f64());
-    assert_eq!(trained, scored);
+    assert_eq!(*trained, json(folder.succeed("eval @run --json"))["mean"]);
 }
 
 #[test]
 fn a_sweep_of_parts_trains_every_model_and_leaves_pages() {
-    let folder = tempfile::tempdir().unwrap();
-    let set = folder.path().join("set");
-    make_set(&set, true);
-    let (set, out) = (set.display(), folder.path().join("parts"));
-    let sweep = format!("sweep {set} --out {} --table parts {SMALL}", out.display());
-    let table = succeed(&sweep);
+    let folder = with_set(true);
+    let table = folder.succeed(&format!("sweep @set --out @parts --table parts {SMALL}"));
     for name in ["plain", "denoiser", "tonemapper", "structure", "depth", "all"] {
-        assert!(out.join(format!("parts={name}/metrics.json")).is_file(), "{name}");
+        assert!(folder.path(&format!("parts/parts={name}/metrics.json")).is_file(), "{name}");
         assert!(table.contains(name), "{table}");
     }
-    assert!(table.contains("PSNR, dB of R_0") && table.contains("gain"), "{table}");
-    let page = std::fs::read_to_string(out.join("index.html")).unwrap();
-    assert!(page.contains("differences to parts plain") && page.contains("data:image/png"));
-    let costs = std::fs::read_to_string(out.join("costs.html")).unwrap();
-    assert!(costs.contains("device, MiB") && costs.contains("Gaussians"), "{costs}");
+    says(&table, &["PSNR, dB of R_0", "gain"]);
+    says(&folder.text("parts/index.html"), &["differences to parts plain", "data:image/png"]);
+    says(&folder.text("parts/costs.html"), &["device, MiB", "Gaussians"]);
 }
 
 #[test]
 fn a_sweep_of_parts_leaves_out_depth_if_the_dataset_has_none() {
-    let folder = tempfile::tempdir().unwrap();
-    let set = folder.path().join("set");
-    make_set(&set, false);
-    let out = folder.path().join("parts");
-    let sweep = format!("sweep {} --out {} --table parts --dry-run", set.display(), out.display());
-    let lines = succeed(&sweep);
+    let lines = with_set(false).succeed("sweep @set --out @parts --table parts --dry-run");
     assert!(lines.lines().count() == 5 && !lines.contains("parts=depth"), "{lines}");
 }
 
 #[test]
 fn a_preset_sets_the_paper_s_values_and_options_override_it() {
-    let folder = tempfile::tempdir().unwrap();
-    let set = folder.path().join("shrub");
-    make_set(&set, false);
-    let run = folder.path().join("run");
-    let (set, at) = (set.display(), run.display());
-    succeed(&format!("train {set} --out {at} --preset lom --model plain {SMALL}"));
-    let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
-    for line in
-        ["steps = 12", "ssim_weight = 0.4", "seed = 10", "means_rate_steps = 20000", "stages = 1"]
-    {
-        assert!(config.contains(line), "no `{line}` in {config}");
-    }
+    let folder = Folder::empty();
+    make_set(&folder.path("shrub"), false);
+    folder.succeed(&format!("train @shrub --out @run --preset lom --model plain {SMALL}"));
+    let lines =
+        ["steps = 12", "ssim_weight = 0.4", "seed = 10", "means_rate_steps = 20000", "stages = 1"];
+    says(&folder.text("run/config.toml"), &lines);
 }

@@ -1,26 +1,19 @@
 //! Views too large for one pass are rendered and trained on in patches, with the same result.
 
-use std::fs;
-
-use glam::DVec3;
-use nightsplat::gpu::testing::gpu;
-use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer};
-use nightsplat::train::{Part, Rendered, TrainConfig, Trainer};
+use nightsplat::splats::render::{self, Damping};
+use nightsplat::train::{Part, Rendered};
 use nightsplat_core::camera::TrainingFrame;
-use nightsplat_photographs::dataset::{Dataset, Split, View};
-use nightsplat_photographs::image::{Image, Mask};
-use nightsplat_photographs::metrics::Scores;
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat_photographs::dataset::View;
+use nightsplat_photographs::image::Mask;
 
 use crate::common::command::{command, refused, succeed};
-use crate::common::setup::{Setup, features};
-use crate::common::train::advance;
-use crate::common::workspace::Workspace;
-use crate::common::{Random, not_run};
+use crate::common::not_run;
+use crate::common::prelude::*;
+use crate::common::setup::features;
 
 /// Gaussians of every kind in a view of several patches; some are far outside it.
 fn setup(patch_pixels: Option<u64>) -> Setup {
-    let shape = nightsplat::splats::scene::Shape { sh_degree: 2, features: features(5) };
+    let shape = Shape { sh_degree: 2, features: features(5) };
     let mut setup = Setup::new(400, [83, 57], shape, 3);
     setup.settings.patch_pixels = patch_pixels;
     setup

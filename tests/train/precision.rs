@@ -1,12 +1,10 @@
 //! Runs that store data in fewer bits: exact formats give the same run, the others a close one.
 
-use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::gpu;
-use nightsplat::train::{PhotographBits, PrecisionConfig, TrainConfig, Trainer};
-use nightsplat_photographs::dataset::Dataset;
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::train::{PhotographBits, PrecisionConfig};
+
+use crate::common::prelude::*;
 
 /// The device and the peak of its memory are shared: one test at a time.
 fn alone() -> MutexGuard<'static, ()> {
@@ -25,7 +23,7 @@ fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<f64>, Vec<f32>, u64) {
     let gpu = OWN.get_or_init(crate::common::own_gpu);
     let mut trainer = Trainer::new(gpu, config.clone(), dataset).unwrap();
     gpu.reset_peak_memory();
-    let reports = crate::common::train::advance(&mut trainer, config.steps);
+    let reports = advance(&mut trainer, config.steps);
     let losses = reports.into_iter().map(|report| report.loss).collect();
     (losses, trainer.gaussians().unwrap().parameters, gpu.peak_memory())
 }

@@ -1,21 +1,13 @@
 //! Interrupted runs that are resumed.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::Stdio;
-use std::time::Duration;
-
-use glam::Vec3;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::results::run::{self, Event, IfExists};
 use nightsplat::splats::scene::Attribute;
-use nightsplat::train::{Background, EndReason, Part, StepReport, TrainConfig, Trainer};
-use nightsplat_photographs::dataset::{Dataset, Split, View};
-use nightsplat_photographs::image::Image;
+use nightsplat::train::{Background, EndReason, Part, StepReport};
+use nightsplat_photographs::dataset::View;
 use safetensors::SafeTensors;
 
 use crate::common::command::{command, refused, succeed};
-use crate::common::train::{advance, small_set};
+use crate::common::prelude::*;
 use crate::common::workspace::log;
 
 /// A dataset of nine small views.
@@ -45,6 +37,17 @@ fn finished(trainer: &mut Trainer, folder: &Path) -> (Vec<u8>, Vec<StepReport>) 
     let path = folder.join("end.safetensors");
     trainer.save_checkpoint(&path).unwrap();
     (fs::read(path).unwrap(), reports)
+}
+
+/// A new trainer with the state of another that was interrupted at a step.
+fn restored(new: impl Fn() -> Trainer, step: u64, folder: &Path) -> Trainer {
+    let checkpoint = folder.join("checkpoint.safetensors");
+    let mut interrupted = new();
+    advance(&mut interrupted, step);
+    interrupted.save_checkpoint(&checkpoint).unwrap();
+    let mut restored = new();
+    restored.restore(&checkpoint).unwrap();
+    restored
 }
 
 #[test]
@@ -105,12 +108,7 @@ fn growth_and_the_sh_degree_stop_if_held_out_views_gain_too_little_and_stay_so_a
     assert!(colors(&ended).iter().all(|rest| *rest == Vec3::ZERO));
     assert!(colors(&freely).iter().any(|rest| *rest != Vec3::ZERO));
     for step in [13, 16, 20] {
-        let checkpoint = folder.path().join("checkpoint.safetensors");
-        let mut interrupted = new(&ending);
-        advance(&mut interrupted, step);
-        interrupted.save_checkpoint(&checkpoint).unwrap();
-        let mut restored = new(&ending);
-        restored.restore(&checkpoint).unwrap();
+        let mut restored = restored(|| new(&ending), step, folder.path());
         assert!(finished(&mut restored, folder.path()).0 == expected, "from step {step}");
     }
 }
@@ -160,12 +158,7 @@ fn a_run_that_converges_settles_and_ends_and_so_does_one_that_is_killed_and_resu
     assert_eq!((end.reason, end.step), (EndReason::Converged, 39));
     // During growth, after a score, at convergence, and while it settles.
     for step in [5, 20, 25, 30, 34] {
-        let checkpoint = folder.path().join("checkpoint.safetensors");
-        let mut interrupted = new();
-        advance(&mut interrupted, step);
-        interrupted.save_checkpoint(&checkpoint).unwrap();
-        let mut restored = new();
-        restored.restore(&checkpoint).unwrap();
+        let mut restored = restored(new, step, folder.path());
         assert!(ended(&mut restored, folder.path()) == expected, "from step {step}");
         assert_eq!(restored.end().unwrap(), end);
     }

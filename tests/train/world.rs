@@ -1,16 +1,11 @@
 //! The world's origin and unit make no difference to a model.
 
-use glam::{DAffine3, DVec3};
-use nightsplat::gpu::testing::gpu;
 use nightsplat::results::eval::{self, After, Evaluation, Metric, ModelRenderer};
 use nightsplat::results::run::{self, IfExists};
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::ply;
-use nightsplat::train::{TrainConfig, Trainer};
 use nightsplat_core::camera::TrainingFrame;
-use nightsplat_photographs::dataset::Dataset;
 
-use crate::common::train::advance;
+use crate::common::prelude::*;
 
 fn config() -> TrainConfig {
     let mut config = TrainConfig { steps: 150, ..TrainConfig::bare() };
@@ -81,7 +76,7 @@ fn a_run_in_any_world_is_scored_as_trained_and_its_model_is_in_that_world() {
         assert!((again - then).abs() < 0.01, "{scale} at {offset}: {again}, not {then}");
 
         // Other programs see positions in the world, relative to the origin in the header.
-        let header = std::fs::read(out.join("model.ply")).unwrap();
+        let header = fs::read(out.join("model.ply")).unwrap();
         let header = String::from_utf8_lossy(&header[..400]).into_owned();
         assert!(header.contains(&stated), "{header}");
         let origin = frame.file_origin();
@@ -141,10 +136,10 @@ fn a_resumed_run_stays_in_its_frame_and_an_old_run_in_its_world() {
     assert_ne!(dataset.frame(), TrainingFrame::WORLD);
     // As written by a version without frames.
     let path = out.join("config.toml");
-    let text = std::fs::read_to_string(&path).unwrap();
+    let text = fs::read_to_string(&path).unwrap();
     let (before, after) = text.split_once("[frame]\n").unwrap();
     let after = after.split_once("\n[").map_or("", |(_, after)| after);
-    std::fs::write(&path, format!("{before}[{after}")).unwrap();
+    fs::write(&path, format!("{before}[{after}")).unwrap();
     let longer = TrainConfig { steps: 9, ..longer };
     let old = run::train(&gpu(), &longer, &dataset, &out, IfExists::Resume, |_| {}).unwrap();
     assert_eq!(*old.trainer.frame(), TrainingFrame::WORLD);

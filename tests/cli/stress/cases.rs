@@ -1,14 +1,9 @@
 //! The table of hostile inputs.
 
-use glam::Vec3;
 use nightsplat::Result;
-use nightsplat::gpu::Gpu;
-use nightsplat::splats::render::RenderSettings;
-use nightsplat::splats::scene::Gaussians;
-use nightsplat_core::random::Stream;
-use nightsplat_photographs::tone::ToneSettings;
 
 use super::hostile::{Hostile, camera_of_focal};
+use crate::common::prelude::*;
 
 /// An input and its expected outcome.
 #[derive(Debug)]
@@ -179,175 +174,106 @@ fn sh(dc: f32, rest: f32) -> Result<Hostile> {
     }))
 }
 
+/// No Gaussian at all.
+fn none() -> Hostile {
+    let gaussians = Some(Gaussians::zeros(0, 3));
+    Hostile { gaussians, concerned: 0..0, ..Hostile::gaussians(1, SIZE, |_, _| ()) }
+}
+
+fn photograph(grey: impl Fn(u32, u32) -> f32) -> Result<Hostile> {
+    Ok(Hostile::photograph(|x, y| [grey(x, y); 3]))
+}
+
+fn black_by_auto() -> Result<Hostile> {
+    let mut hostile = photograph(|_, _| 0.0)?;
+    hostile.config.tone = ToneSettings::default();
+    Ok(hostile)
+}
+
 fn gain(gain: f32) -> Result<Hostile> {
     Hostile::gaussians(1, SIZE, |_, _| ()).exposed(gain)
 }
 
-const fn case(
-    name: &'static str,
-    outcome: &'static str,
-    expect: Expect,
-    build: fn(&Gpu) -> Result<Hostile>,
-) -> Case {
-    Case { name, outcome, effort: Effort::Small, expect, build }
-}
-
-const fn quick(mut case: Case) -> Case {
-    case.effort = Effort::Quick;
-    case
-}
-
-const fn large(mut case: Case) -> Case {
-    case.effort = Effort::Large;
-    case
-}
-
 use Expect::{Learns, NoTrace, Refusal, Trains};
 
+/// A row: the effort, the input, its outcome in words and in a checkable form, and what builds it.
+macro_rules! cases {
+    ($($effort:ident $name:literal: $outcome:literal, $expect:expr, $build:expr;)*) => {
+        &[$(Case { name: $name, outcome: $outcome, effort: Effort::$effort, expect: $expect, build: $build }),*]
+    };
+}
+
 /// Every input.
-pub(super) const CASES: &[Case] = &[
-    case(
-        "scales 1e-20",
-        "a dot as wide as the dilation; Adam raises them to e^-30",
-        Trains,
-        |_| scales([-20.0; 3]),
-    ),
-    case("scales 1e-20, 1, 1e-20", "a needle as wide as the dilation", Learns, |_| {
-        scales([-20.0, 0.0, -20.0])
-    }),
-    case("scales 1e3", "covers the view", Learns, |_| scales([3.0; 3])),
-    case(
-        "scales 1e10",
-        "culled, then lowered by Adam to e^13, which covers the view",
-        Trains,
-        |_| scales([10.0; 3]),
-    ),
-    case(
-        "scales 1e20",
-        "culled, then lowered by Adam to e^13, which covers the view",
-        Trains,
-        |_| scales([20.0; 3]),
-    ),
-    quick(case("scales 1e-20, 1, 1e20", "culled, then lowered by Adam to e^13", Trains, |_| {
-        scales([-20.0, 0.0, 20.0])
-    })),
-    case("raw opacity -100", "culled: no trace", NoTrace, |_| opacity(-100.0)),
-    case("raw opacity -20", "culled: no trace", NoTrace, |_| opacity(-20.0)),
-    case("raw opacity -5.5", "just above 1/255: learns", Learns, |_| opacity(-5.5)),
-    quick(case("raw opacity 20", "opaque; learns", Learns, |_| opacity(20.0))),
-    case("raw opacity 100", "opaque; learns but for its opacity", Learns, |_| opacity(100.0)),
-    case("quaternion 0", "unturned, and no gradient turns it", Learns, |_| quat([0.0; 4])),
-    case("quaternion 1e-40", "unturned, and no gradient turns it", Learns, |_| {
-        quat([1e-40, 2e-40, -1e-40, 0.0])
-    }),
-    case("quaternion 1e-10", "as of unit length", Learns, |_| quat([1e-10, 2e-10, -1e-10, 3e-11])),
-    case("quaternion 1e15", "as of unit length", Learns, |_| quat([1e15, 2e15, -1e15, 3e14])),
-    quick(case("quaternion 1e30", "as of unit length", Learns, |_| {
-        quat([1e30, 2e30, -1e30, 3e29])
-    })),
-    case("quaternion 1e38", "as of unit length", Learns, |_| quat([1e38, 2e38, -1e38, 3e37])),
-    case("mean on the near plane", "culled: no trace", NoTrace, |_| mean(0.0, 0.0, 0.2)),
-    case("mean 1e-6 beyond the near plane", "seen", Learns, |_| {
-        mean(0.01, 0.0, 0.200_001).map(at_once)
-    }),
-    case("mean behind the camera", "culled: no trace", NoTrace, |_| mean(0.1, 0.1, -3.0)),
-    case("mean in the camera", "culled: no trace", NoTrace, |_| mean(0.0, 0.0, 0.0)),
-    case("mean 1e-7 away", "culled: no trace", NoTrace, |_| mean(1e-8, 1e-8, 1e-7)),
-    case("mean 1e7 away", "a dot as wide as the dilation", Learns, |_| mean(1e5, 1e5, 1e7)),
-    case("mean 1e7 beside", "outside of the view: no trace", NoTrace, |_| mean(1e7, 0.0, 3.0)),
-    quick(case("mean 1e30 away", "a dot as wide as the dilation", Learns, |_| {
-        mean(1e28, 1e28, 1e30)
-    })),
-    case("mean 1e38 beside", "culled: no trace", NoTrace, |_| mean(1e38, 0.0, 3.0)),
-    case("all of these at once", "as each by itself", Learns, |_| all_at_once()),
-    case("500 coincident", "blended in the order of their numbers", Learns, |_| coincident(500)),
-    large(case("5000 coincident", "blended in the order of their numbers", Learns, |_| {
-        coincident(5000)
-    })),
-    large(case("one over 16 000 tiles", "covers the view", Learns, |_| wide())),
-    case(
-        "2000 on one pixel",
-        "blended; those after a saturated pixel have no gradient",
-        Learns,
-        |_| splats_per_tile(2000),
-    ),
-    large(case(
-        "100 000 on one pixel",
-        "blended; those after a saturated pixel have no gradient",
-        Learns,
-        |_| splats_per_tile(100_000),
-    )),
-    quick(case("no Gaussian", "black", Trains, |_| {
-        size(32, 24).map(|mut hostile| {
-            hostile.gaussians = Some(Gaussians::zeros(0, 3));
-            hostile.concerned = 0..0;
-            hostile
-        })
-    })),
-    case("one Gaussian", "learns", Learns, |_| Ok(Hostile::alone(SIZE))),
-    case("focal length 1", "seen", Learns, |_| focal(1.0)),
-    case("focal length 1e3", "seen", Learns, |_| focal(1e3)),
-    case("focal length 1e6", "seen", Learns, |_| focal(1e6).map(at_once)),
-    case("view 1x1", "learns", Learns, |_| size(1, 1)),
-    quick(case("view 1x64", "learns", Learns, |_| size(1, 64))),
-    case("view 64x1", "learns", Learns, |_| size(64, 1)),
-    Case {
-        effort: Effort::Unchecked,
-        ..case("the largest square view, to 8192", "learns", Learns, largest)
-    },
-    case(
-        "view 65535x65535",
-        "refused, with the longest side that the device takes",
-        Refusal("max_resolution"),
-        beyond,
-    ),
-    case("SH coefficients 1e6 of degree 0", "learns", Learns, |_| sh(1e6, 0.0)),
-    case("SH coefficients 1e6 above degree 0", "learns", Learns, |_| sh(0.0, 1e6)),
-    case("exposure gain 1e-6", "learns", Trains, |_| gain(1e-6)),
-    quick(case("exposure gain 1e6", "learns", Trains, |_| gain(1e6))),
-    quick(case("photograph black: p90 = 0", "trains towards a target of black", Trains, |_| {
-        Ok(Hostile::photograph(|_, _| [0.0; 3]))
-    })),
-    case("photograph black, curve auto", "refused: all black", Refusal("almost black"), |_| {
-        let mut hostile = Hostile::photograph(|_, _| [0.0; 3]);
-        hostile.config.tone = ToneSettings::default();
-        Ok(hostile)
-    }),
-    case("photograph of one value: p10 = p90", "trains", Trains, |_| {
-        Ok(Hostile::photograph(|_, _| [0.05; 3]))
-    }),
-    case("photograph white", "trains", Trains, |_| Ok(Hostile::photograph(|_, _| [1.0; 3]))),
-    case("photograph black but for one pixel", "trains", Trains, |_| {
-        Ok(Hostile::photograph(|x, y| [f32::from(u8::from(x == 5 && y == 7)); 3]))
-    }),
-    case("EXR scaled by 1e-6", "trains", Trains, |_| Hostile::exr(|value, _, _| 1e-6 * value)),
-    case("EXR scaled by 1e6", "trains", Trains, |_| Hostile::exr(|value, _, _| 1e6 * value)),
-    case("EXR of denormals", "trains as black", Trains, |_| {
-        Hostile::exr(|value, _, _| 1e-40 * value)
-    }),
-    case("EXR with NaN", "their pixels do not count, and a warning counts them", Trains, |_| {
-        Hostile::exr(|value, x, y| if (x + y) % 5 == 0 { f32::NAN } else { value })
-    }),
-    quick(case(
-        "EXR with infinity and below 0",
-        "infinite ones do not count, negative ones are black, and a warning counts them",
-        Trains,
-        |_| {
-            Hostile::exr(|value, x, y| match (x + y) % 5 {
-                0 => f32::INFINITY,
-                1 => f32::NEG_INFINITY,
-                2 => -value,
-                _ => value,
-            })
-        },
-    )),
-    case("EXR with 1e38", "trains", Trains, |_| {
-        Hostile::exr(|value, x, y| if (x + y) % 5 == 0 { 1e38 } else { value })
-    }),
-    case(
-        "EXR of NaN",
-        "refused: no pixel is a number",
-        Refusal("no photograph is left to train on"),
-        |_| Hostile::exr(|_, _, _| f32::NAN),
-    ),
-];
+pub(super) const CASES: &[Case] = cases! {
+    Small "scales 1e-20": "a dot as wide as the dilation; Adam raises them to e^-30", Trains, |_| scales([-20.0; 3]);
+    Small "scales 1e-20, 1, 1e-20": "a needle as wide as the dilation", Learns, |_| scales([-20.0, 0.0, -20.0]);
+    Small "scales 1e3": "covers the view", Learns, |_| scales([3.0; 3]);
+    Small "scales 1e10": "culled, then lowered by Adam to e^13, which covers the view", Trains, |_| scales([10.0; 3]);
+    Small "scales 1e20": "culled, then lowered by Adam to e^13, which covers the view", Trains, |_| scales([20.0; 3]);
+    Quick "scales 1e-20, 1, 1e20": "culled, then lowered by Adam to e^13", Trains, |_| scales([-20.0, 0.0, 20.0]);
+    Small "raw opacity -100": "culled: no trace", NoTrace, |_| opacity(-100.0);
+    Small "raw opacity -20": "culled: no trace", NoTrace, |_| opacity(-20.0);
+    Small "raw opacity -5.5": "just above 1/255: learns", Learns, |_| opacity(-5.5);
+    Quick "raw opacity 20": "opaque; learns", Learns, |_| opacity(20.0);
+    Small "raw opacity 100": "opaque; learns but for its opacity", Learns, |_| opacity(100.0);
+    Small "quaternion 0": "unturned, and no gradient turns it", Learns, |_| quat([0.0; 4]);
+    Small "quaternion 1e-40": "unturned, and no gradient turns it", Learns, |_| quat([1e-40, 2e-40, -1e-40, 0.0]);
+    Small "quaternion 1e-10": "as of unit length", Learns, |_| quat([1e-10, 2e-10, -1e-10, 3e-11]);
+    Small "quaternion 1e15": "as of unit length", Learns, |_| quat([1e15, 2e15, -1e15, 3e14]);
+    Quick "quaternion 1e30": "as of unit length", Learns, |_| quat([1e30, 2e30, -1e30, 3e29]);
+    Small "quaternion 1e38": "as of unit length", Learns, |_| quat([1e38, 2e38, -1e38, 3e37]);
+    Small "mean on the near plane": "culled: no trace", NoTrace, |_| mean(0.0, 0.0, 0.2);
+    Small "mean 1e-6 beyond the near plane": "seen", Learns, |_| mean(0.01, 0.0, 0.200_001).map(at_once);
+    Small "mean behind the camera": "culled: no trace", NoTrace, |_| mean(0.1, 0.1, -3.0);
+    Small "mean in the camera": "culled: no trace", NoTrace, |_| mean(0.0, 0.0, 0.0);
+    Small "mean 1e-7 away": "culled: no trace", NoTrace, |_| mean(1e-8, 1e-8, 1e-7);
+    Small "mean 1e7 away": "a dot as wide as the dilation", Learns, |_| mean(1e5, 1e5, 1e7);
+    Small "mean 1e7 beside": "outside of the view: no trace", NoTrace, |_| mean(1e7, 0.0, 3.0);
+    Quick "mean 1e30 away": "a dot as wide as the dilation", Learns, |_| mean(1e28, 1e28, 1e30);
+    Small "mean 1e38 beside": "culled: no trace", NoTrace, |_| mean(1e38, 0.0, 3.0);
+    Small "all of these at once": "as each by itself", Learns, |_| all_at_once();
+    Small "500 coincident": "blended in the order of their numbers", Learns, |_| coincident(500);
+    Large "5000 coincident": "blended in the order of their numbers", Learns, |_| coincident(5000);
+    Large "one over 16 000 tiles": "covers the view", Learns, |_| wide();
+    Small "2000 on one pixel": "blended; those after a saturated pixel have no gradient", Learns,
+        |_| splats_per_tile(2000);
+    Large "100 000 on one pixel": "blended; those after a saturated pixel have no gradient", Learns,
+        |_| splats_per_tile(100_000);
+    Quick "no Gaussian": "black", Trains, |_| Ok(none());
+    Small "one Gaussian": "learns", Learns, |_| Ok(Hostile::alone(SIZE));
+    Small "focal length 1": "seen", Learns, |_| focal(1.0);
+    Small "focal length 1e3": "seen", Learns, |_| focal(1e3);
+    Small "focal length 1e6": "seen", Learns, |_| focal(1e6).map(at_once);
+    Small "view 1x1": "learns", Learns, |_| size(1, 1);
+    Quick "view 1x64": "learns", Learns, |_| size(1, 64);
+    Small "view 64x1": "learns", Learns, |_| size(64, 1);
+    Unchecked "the largest square view, to 8192": "learns", Learns, largest;
+    Small "view 65535x65535": "refused, with the longest side that the device takes", Refusal("max_resolution"), beyond;
+    Small "SH coefficients 1e6 of degree 0": "learns", Learns, |_| sh(1e6, 0.0);
+    Small "SH coefficients 1e6 above degree 0": "learns", Learns, |_| sh(0.0, 1e6);
+    Small "exposure gain 1e-6": "learns", Trains, |_| gain(1e-6);
+    Quick "exposure gain 1e6": "learns", Trains, |_| gain(1e6);
+    Quick "photograph black: p90 = 0": "trains towards a target of black", Trains, |_| photograph(|_, _| 0.0);
+    Small "photograph black, curve auto": "refused: all black", Refusal("almost black"), |_| black_by_auto();
+    Small "photograph of one value: p10 = p90": "trains", Trains, |_| photograph(|_, _| 0.05);
+    Small "photograph white": "trains", Trains, |_| photograph(|_, _| 1.0);
+    Small "photograph black but for one pixel": "trains", Trains,
+        |_| photograph(|x, y| f32::from(u8::from(x == 5 && y == 7)));
+    Small "EXR scaled by 1e-6": "trains", Trains, |_| Hostile::exr(|value, _, _| 1e-6 * value);
+    Small "EXR scaled by 1e6": "trains", Trains, |_| Hostile::exr(|value, _, _| 1e6 * value);
+    Small "EXR of denormals": "trains as black", Trains, |_| Hostile::exr(|value, _, _| 1e-40 * value);
+    Small "EXR with NaN": "their pixels do not count, and a warning counts them", Trains,
+        |_| Hostile::exr(|value, x, y| if (x + y) % 5 == 0 { f32::NAN } else { value });
+    Quick "EXR with infinity and below 0":
+        "infinite ones do not count, negative ones are black, and a warning counts them", Trains,
+        |_| Hostile::exr(|value, x, y| match (x + y) % 5 {
+            0 => f32::INFINITY,
+            1 => f32::NEG_INFINITY,
+            2 => -value,
+            _ => value,
+        });
+    Small "EXR with 1e38": "trains", Trains,
+        |_| Hostile::exr(|value, x, y| if (x + y) % 5 == 0 { 1e38 } else { value });
+    Small "EXR of NaN": "refused: no pixel is a number", Refusal("no photograph is left to train on"),
+        |_| Hostile::exr(|_, _, _| f32::NAN);
+};

@@ -1,21 +1,14 @@
 //! The scene of a case: a small ordinary one, parts of which are made hostile.
 
 use std::ops::Range;
-use std::path::PathBuf;
 
-use glam::{DVec2, DVec3, Vec3};
 use nightsplat::bench::scene;
 use nightsplat::loss::exposure::{Affine, table};
-use nightsplat::splats::scene::Gaussians;
-use nightsplat::train::TrainConfig;
 use nightsplat::{Error, Result};
-use nightsplat_core::camera::{Camera, TrainingFrame};
-use nightsplat_core::random::Stream;
-use nightsplat_photographs::dataset::{Dataset, Point, Split, View};
-use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb};
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat_core::camera::TrainingFrame;
+use nightsplat_photographs::dataset::{Point, View};
 
-use crate::common::train::small_set;
+use crate::common::prelude::*;
 
 /// A dataset, its first Gaussians unless they come from its points, and the indices of the hostile ones.
 pub(super) struct Hostile {

@@ -7,6 +7,7 @@ use nightsplat_photographs::image::ImageFile as _;
 use nightsplat_photographs::tone::CurveChoice;
 
 use super::*;
+use crate::common::command::says;
 
 fn args(pairs: &[PathBuf]) -> FitArgs {
     FitArgs {
@@ -33,7 +34,7 @@ fn args(pairs: &[PathBuf]) -> FitArgs {
 fn scene(folder: &Path, count: u64) {
     let settings = truth(ToneCurve::Reinhard.family());
     for name in ["low", "high"] {
-        std::fs::create_dir_all(folder.join(name)).unwrap();
+        fs::create_dir_all(folder.join(name)).unwrap();
     }
     for seed in 0..count {
         let dark = dark(40, 0.05, 0.0, seed);
@@ -62,7 +63,7 @@ fn a_written_curve_is_accepted_by_other_commands() {
     let best = &fitted[0];
     let choice: CurveChoice = out.to_str().unwrap().parse().unwrap();
     assert_eq!(choice.settings().unwrap(), best.fit.settings.clone().rounded());
-    let written = std::fs::read_to_string(&out).unwrap();
+    let written = fs::read_to_string(&out).unwrap();
     let numbers = written.lines().filter_map(|line| line.split_once(" = ")).map(|(_, text)| text);
     assert!(
         numbers.filter(|text| text.parse::<f64>().is_ok()).all(|text| text.len() <= 12),
@@ -75,7 +76,7 @@ fn a_written_curve_is_accepted_by_other_commands() {
     assert!(scores.is_sorted_by(|a, b| a >= b), "{scores:?}");
     // Noise of 0.02 leaves 34 dB.
     assert!((scores[0] - 34.0).abs() < 0.5, "{scores:?}");
-    let svg = std::fs::read_to_string(plot).unwrap();
+    let svg = fs::read_to_string(plot).unwrap();
     assert!(svg.starts_with("<svg xmlns=") && svg.contains("--series-0: #"), "{svg}");
 }
 
@@ -98,11 +99,9 @@ fn a_formula_is_fitted_within_its_bounds_and_written_for_other_commands() {
     assert!(fitted.fit.psnr.fitted > 33.0, "{:?}", fitted.fit.psnr);
     let choice: CurveChoice = out.to_str().unwrap().parse().unwrap();
     assert_eq!(choice.settings().unwrap(), fitted.fit.settings.clone().rounded());
-    let written = std::fs::read_to_string(&out).unwrap();
-    for part in ["# a*t/(t+b)\n", "curve = \"a*t/(t+b)\"", "[bounds]", "b = [0.01, 5.0]"] {
-        assert!(written.contains(part), "no {part} in {written}");
-    }
-    assert!(std::fs::read_to_string(plot).unwrap().contains("a*t/(t+b) fitted"));
+    let written = fs::read_to_string(&out).unwrap();
+    says(&written, &["# a*t/(t+b)\n", "curve = \"a*t/(t+b)\"", "[bounds]", "b = [0.01, 5.0]"]);
+    assert!(fs::read_to_string(plot).unwrap().contains("a*t/(t+b) fitted"));
     // What was fitted is where the next fit starts.
     let again = FitArgs { family: out.to_str().unwrap().parse().unwrap(), ..args };
     assert!((apply(&again).unwrap()[0].fit.psnr.fitted - fitted.fit.psnr.fitted).abs() < 1e-3);
@@ -147,10 +146,10 @@ fn pairs_that_cannot_be_used_are_named_in_one_line() {
     );
 
     // A photograph without a partner is left out; without any pair, nothing is left.
-    std::fs::remove_file(path("good/high/1.png")).unwrap();
+    fs::remove_file(path("good/high/1.png")).unwrap();
     assert_eq!(apply(&args(&[path("good")])).unwrap()[0].fit.values, 4800.0);
     fails(FitArgs { cross_validate: true, ..args(&[path("good")]) }, "1 pairs in 5 folds", 2);
-    std::fs::rename(path("good/high/0.png"), path("good/high/7.png")).unwrap();
+    fs::rename(path("good/high/0.png"), path("good/high/7.png")).unwrap();
     fails(args(&[path("good")]), "no photograph has a partner", 3);
 
     scene(&path("sizes"), 2);
@@ -162,7 +161,7 @@ fn pairs_that_cannot_be_used_are_named_in_one_line() {
     fails(args(&[path("twins")]), "same name", 3);
 
     scene(&path("broken"), 1);
-    std::fs::write(path("broken/low/0.png"), b"no image").unwrap();
+    fs::write(path("broken/low/0.png"), b"no image").unwrap();
     fails(args(&[path("broken")]), "0.png", 3);
 
     scene(&path("black"), 2);

@@ -27,7 +27,7 @@ fn truth() -> Profile {
 /// profile of the colours at the gain of the first, with noise.
 fn scene(folder: &Path, exposures: &[f64], noise: f64) {
     for name in ["low", "high"] {
-        std::fs::create_dir_all(folder.join(name)).unwrap();
+        fs::create_dir_all(folder.join(name)).unwrap();
     }
     let (first, stream) = (dark(120, 0.04, 0.0, 5), Stream::new(5, 9));
     // The gain at which the rule gives the first photograph, by itself, its brightness.

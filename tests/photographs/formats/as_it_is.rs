@@ -1,16 +1,8 @@
 //! Output of COLMAP and other tools: several models, photographs without a pose, rigs, byte-order marks, real lenses.
 
-use std::fs;
-use std::path::Path;
+use nightsplat_core::camera::Camera;
 
-use glam::DVec2;
-use nightsplat_core::camera::{Camera, CameraModel, KannalaBrandt};
-use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
-use serde_json::json;
-
-use super::synthetic::*;
-use super::{load, names, refuses, view};
-use crate::common::command::run;
+use super::*;
 
 /// The standard error of `tone apply` for a dataset; one line for each remark.
 fn message_of(root: &Path) -> String {
@@ -32,10 +24,7 @@ fn of_several_models_the_one_with_the_most_photographs_is_used_and_named() {
     assert_eq!(dataset.points.len(), 20);
     assert!(dataset.points[0].views.len() > 2);
     let message = message_of(root);
-    assert!(
-        message.contains("3 models, of 2, 9, 0 photographs; sparse/1, the largest"),
-        "{message}"
-    );
+    says(&message, &["3 models, of 2, 9, 0 photographs; sparse/1, the largest"]);
 }
 
 #[test]
@@ -79,7 +68,7 @@ fn the_cameras_of_a_rig_may_have_equal_file_names() {
     let all: Vec<&str> = dataset.views.iter().map(|view| view.name.as_str()).collect();
     assert_eq!(all, ["a_000", "a_001", "a_002", "a_003", "b_000", "b_001", "b_002", "b_003"]);
     assert_eq!(names(&dataset, Split::Test), ["a_001", "b_003"]);
-    let level = |name: &str| super::level(view(&dataset, name).image.as_ref()).unwrap();
+    let level = |name: &str| level(view(&dataset, name).image.as_ref()).unwrap();
     assert_eq!([level("a_000"), level("b_000"), level("a_001")], [10.0, 11.0, 12.0]);
     assert!(dataset.points.iter().any(|point| point.views.len() > 2));
     // The same names in one listing of a transforms file.
@@ -134,13 +123,13 @@ fn a_rational_lens_is_undistorted_on_load_and_a_fisheye_on_request() {
         assert_eq!(camera.model, CameraModel::Pinhole, "{name}");
         assert!(camera.focal.is_finite() && camera.focal.x != 22.0, "{name}: {camera:?}");
         // No blank pixel: every photograph has a single colour.
-        assert_eq!(super::level(view(&binary, "v04").image.as_ref()), Some(14.0), "{name}");
+        assert_eq!(level(view(&binary, "v04").image.as_ref()), Some(14.0), "{name}");
         assert_eq!(text.views[0].camera, camera, "{name}");
     }
 }
 
 fn undistorted(root: &Path) -> Dataset {
-    Dataset::load(root, &LoadOptions { undistort: true, ..LoadOptions::default() }).unwrap()
+    load_with(root, LoadOptions { undistort: true, ..Default::default() })
 }
 
 #[test]
@@ -172,8 +161,8 @@ fn a_fisheye_is_loaded_natively_from_every_listing_and_masked_outside_its_circle
         }
     }
     // For resized photographs, the mask is that of the resized pixels.
-    let shrunk = LoadOptions { downscale: 1.25, ..LoadOptions::default() };
-    let shrunk = Dataset::load(root, &shrunk).unwrap();
+    let shrunk = LoadOptions { downscale: 1.25, ..Default::default() };
+    let shrunk = load_with(root, shrunk);
     let (camera, mask) = (shrunk.views[0].camera, shrunk.views[0].mask.as_ref().unwrap());
     assert_eq!((camera.focal.x, mask.width, mask.height), (0.8 * fx, 32, 24));
     assert_eq!(mask.hidden(), camera.unseen());
@@ -195,5 +184,5 @@ fn the_part_of_a_fisheye_beyond_a_pinhole_is_cropped_with_a_remark() {
     let (shown, out) = (root.display(), root.join("run"));
     let train = format!("train {shown} --steps 1 --undistort --out {}", out.display());
     let message = run(&train, 0).1;
-    assert!(message.contains("fisheye") && message.contains("60 degrees"), "{message}");
+    says(&message, &["fisheye", "60 degrees"]);
 }

@@ -1,13 +1,6 @@
 //! Bad input: one line that names the object, no panic, no huge allocation.
 
-use std::fs;
-
-use glam::DVec3;
-use nightsplat_photographs::dataset::{LoadOptions, Split};
-use serde_json::json;
-
-use super::synthetic::*;
-use super::{load, names, refuses, refuses_with, view};
+use super::*;
 
 #[test]
 fn a_missing_or_empty_folder_is_named() {
@@ -268,12 +261,12 @@ fn a_photograph_of_one_pixel_is_named_rather_than_an_option() {
 fn a_downscale_that_leaves_no_image_is_misuse() {
     let folder = Folder::with_listing(3, |_| ());
     for downscale in [0.0, -2.0, f64::NAN, f64::INFINITY, 0.5] {
-        let options = LoadOptions { downscale, ..LoadOptions::default() };
+        let options = LoadOptions { downscale, ..Default::default() };
         refuses_with(&folder, &options, 2, &["downscale"]);
     }
-    let options = LoadOptions { downscale: 2.0, ..LoadOptions::default() };
+    let options = LoadOptions { downscale: 2.0, ..Default::default() };
     refuses_with(&folder, &options, 2, &["20x15", "at least 16"]);
     let reference = Some(folder.join("nowhere"));
-    let options = LoadOptions { reference, ..LoadOptions::default() };
+    let options = LoadOptions { reference, ..Default::default() };
     refuses_with(&folder, &options, 3, &["nowhere"]);
 }

@@ -1,16 +1,12 @@
 //! Photographs in other colour spaces, and white balance, in a dataset.
 
-use std::fs;
-use std::path::Path;
-
 use nightsplat::LoadOptions;
-use nightsplat_photographs::dataset::{Dataset, View};
-use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
+use nightsplat_photographs::image::linear_from_srgb;
+use nightsplat_photographs::image::srgb_from_linear;
 
-use super::synthetic::*;
-use super::{load, view};
-use crate::common::command::{refused, run};
 use crate::common::png::put_chunk;
+
+use super::*;
 
 /// Marks every image of a folder as linear light.
 fn mark_linear(folder: &Path) {
@@ -85,7 +81,7 @@ fn one_grey_card_balances_every_photograph_cached_or_not() {
     lamp_lit(root);
     let balanced = |keep: Option<u64>, white: &str| {
         let white_balance = Some(white.parse().unwrap());
-        Dataset::load(root, &LoadOptions { white_balance, keep, ..LoadOptions::default() }).unwrap()
+        load_with(root, LoadOptions { white_balance, keep, ..Default::default() })
     };
     let (stored, kept) = (load(root), balanced(None, "v03,2,2,5,5"));
     for (view, stored) in kept.views.iter().zip(&stored.views) {
@@ -106,15 +102,12 @@ fn one_grey_card_balances_every_photograph_cached_or_not() {
 fn an_invalid_white_balance_is_refused_in_one_line() {
     let root = &Folder::empty();
     lamp_lit(root);
-    let out = root.join("run");
     for (white, code, part) in [
         ("0,1,1", 2, "white_balance (--white-balance) is \"0,1,1\"; it must be R,G,B"),
         ("warm", 2, "(--white-balance) is \"warm\""),
         ("v99,2,2,5,5", 3, "no photograph is called `v99`"),
         ("v03,39,2,5,5", 2, "it exceeds the photograph, which is 40x30"),
     ] {
-        let arguments =
-            format!("train {} --out {} --white-balance {white}", root.display(), out.display());
-        refused(&arguments, code, &[part]);
+        root.refused(&format!("train @ --out @run --white-balance {white}"), code, &[part]);
     }
 }

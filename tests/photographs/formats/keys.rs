@@ -1,18 +1,10 @@
 //! Keys of a listing other than names and poses: points, masks, depth, splits, bad frames; and matrices as written by
 //! exporters.
 
-use std::fs;
-use std::path::Path;
-
-use glam::{DMat3, DVec3};
-use nightsplat_photographs::dataset::{Dataset, DepthOptions, LoadOptions, Split};
-use nightsplat_photographs::image::{Image, ImageFile};
+use nightsplat_photographs::dataset::DepthOptions;
 use serde::Serialize;
-use serde_json::json;
 
-use super::synthetic::*;
-use super::{assert_camera_is_view, load, names, refuses, view};
-use crate::common::log::warnings;
+use super::*;
 
 const POINTS: [[f32; 3]; 4] =
     [[0.5, 0.0, 0.25], [-0.5, 0.25, 0.0], [0.0, 0.5, -0.25], [0.125, 0.0, 0.5]];
@@ -78,13 +70,14 @@ fn an_unsupported_file_of_points_is_named() {
     fs::write(folder.join("scan.las"), "LASF").unwrap();
     fs::write(folder.join("points3d.ply"), "no ply").unwrap();
     let lines = warnings(|| drop(load(&folder)));
-    for part in [
-        "absent.ply, its ply_file_path, is absent",
-        "points3d.ply: is not a PLY file",
-        "points3d.ply: is not read",
-    ] {
-        assert!(lines.contains(part), "no `{part}` in: {lines}");
-    }
+    says(
+        &lines,
+        &[
+            "absent.ply, its ply_file_path, is absent",
+            "points3d.ply: is not a PLY file",
+            "points3d.ply: is not read",
+        ],
+    );
 }
 
 /// A mask that keeps the left half.
@@ -114,13 +107,10 @@ fn listed_masks_are_applied_and_dynamic_masks_inverted() {
         }
         assert_eq!(hidden(&dataset, "v03"), None);
         assert_eq!(dataset.views.len(), 9);
-        let options = LoadOptions { invert_masks: true, ..LoadOptions::default() };
-        assert_eq!(hidden(&Dataset::load(root, &options).unwrap(), "v04"), Some((0.0, 1.0)));
+        let options = LoadOptions { invert_masks: true, ..Default::default() };
+        assert_eq!(hidden(&load_with(root, options), "v04"), Some((0.0, 1.0)));
     });
-    assert!(
-        lines.contains("1 mask files that it names are absent, absent.png the first"),
-        "{lines}"
-    );
+    says(&lines, &["1 mask files that it names are absent, absent.png the first"]);
 }
 
 #[test]
@@ -132,8 +122,7 @@ fn listed_depth_maps_belong_to_their_views() {
         fs::create_dir_all(path.parent().unwrap()).unwrap();
         Image::from_fn(SIZE.0, SIZE.1, |x, _| [0.01 * x as f32; 3]).save_png8(path).unwrap();
         let depth = DepthOptions { load: true, ..DepthOptions::default() };
-        let options = LoadOptions { depth, ..LoadOptions::default() };
-        let dataset = Dataset::load(&folder, &options).unwrap();
+        let dataset = load_with(&folder, LoadOptions { depth, ..Default::default() });
         let depth = view(&dataset, "v01").depth.as_ref().unwrap();
         assert!(depth[0] < depth[39] && view(&dataset, "v02").depth.is_none());
     }
@@ -153,7 +142,7 @@ fn stated_splits_are_kept_and_bad_or_unlisted_frames_left_out() {
     assert_eq!(names(&dataset, Split::Train), ["v00", "v01", "v02", "v03", "v04"]);
     assert_eq!(names(&dataset, Split::Test), ["v06", "v07"]);
     let lines = warnings(|| drop(load(&folder)));
-    assert!(lines.contains("2 frames are in none of its lists"), "{lines}");
+    says(&lines, &["2 frames are in none of its lists"]);
 
     let folder = Folder::with_listing(9, |listing| {
         let all = listing["frames"].as_array().unwrap().clone();
@@ -167,7 +156,7 @@ fn stated_splits_are_kept_and_bad_or_unlisted_frames_left_out() {
     assert_eq!(names(&dataset, Split::Train), ["v00", "v01", "v03", "v04", "v05"]);
     assert_eq!(names(&dataset, Split::Test), ["v07", "v08"]);
     let lines = warnings(|| drop(load(&folder)));
-    assert!(lines.contains("2 frames are marked bad"), "{lines}");
+    says(&lines, &["2 frames are marked bad"]);
 
     let folder = Folder::with_listing(9, |listing| {
         for (index, split) in ["train", "test", "val"].into_iter().enumerate() {
@@ -192,12 +181,12 @@ fn keys_that_are_not_supported_are_named_in_one_line() {
     });
     let lines = warnings(|| drop(load(&folder)));
     assert_eq!(lines.lines().count(), 1, "{lines}");
-    assert!(
-        lines.contains(
+    says(
+        &lines,
+        &[
             "normal_path (9 times, normals/0.png the first), rolling_shutter ([0.0,0.1]), semantics_file \
-             (classes.json)"
-        ),
-        "{lines}"
+             (classes.json)",
+        ],
     );
 }
 

@@ -1,19 +1,12 @@
 //! Folders as left by tools, and listings from another machine.
 
-use std::fs;
 use std::fs::File;
 use std::io::Write;
-use std::path::Path;
 
 use nightsplat::train::diagnose::Diagnosis;
-use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
-use nightsplat_photographs::image::{Image, ImageFile};
-use serde_json::json;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
-use super::synthetic::*;
-use super::{assert_camera_is_view, load, names, refuses, view};
-use crate::common::log::warnings;
+use super::*;
 
 /// Nine views, each with its photograph and camera, and the points of the model.
 fn assert_whole(dataset: &Dataset, what: &str) {
@@ -21,7 +14,7 @@ fn assert_whole(dataset: &Dataset, what: &str) {
     assert!(dataset.skipped.is_empty(), "{what}: {:?}", dataset.skipped);
     for (index, view) in dataset.views.iter().enumerate() {
         assert_camera_is_view(view, index);
-        assert_eq!(super::level(view.image.as_ref()), Some(10.0 + index as f32), "{what}");
+        assert_eq!(level(view.image.as_ref()), Some(10.0 + index as f32), "{what}");
     }
     assert_eq!(dataset.points.len(), 20, "{what}");
     assert_eq!(dataset.points[1].views, [2, 5, 8], "{what}");
@@ -71,8 +64,7 @@ fn every_eighth_photograph_that_is_there_is_held_out_and_none_of_seven() {
     fs::remove_file(folder.join("images/v08.png")).unwrap();
     let dataset = load(&folder);
     assert_eq!((dataset.views.len(), names(&dataset, Split::Test).len()), (7, 0));
-    let options = LoadOptions { test_every: Some(3), ..LoadOptions::default() };
-    let dataset = Dataset::load(&folder, &options).unwrap();
+    let dataset = load_with(&folder, LoadOptions { test_every: Some(3), ..Default::default() });
     assert_eq!(names(&dataset, Split::Test), ["v01", "v04", "v07"]);
 }
 
@@ -90,7 +82,7 @@ fn masks_of_labels_are_told_and_black_ones_named() {
             assert_eq!(view.mask.as_ref().unwrap().weights[18..22], [1.0, 1.0, 0.0, 0.0]);
         }
     });
-    assert!(lines.contains("they are labels, of which 1 shows"), "{lines}");
+    says(&lines, &["they are labels, of which 1 shows"]);
     (0..9).for_each(|index| save(index, f32::from(index != 3)));
     let dataset = load(&folder);
     assert_eq!(dataset.skipped.len(), 1);
@@ -113,9 +105,9 @@ fn cameras_of_a_network_s_input_are_scaled_for_each_axis() {
     let lines = warnings(|| {
         let camera = load(&of_input(392.0)).views[0].camera;
         assert_eq!((camera.width, camera.height), (500, 375));
-        assert!((camera.focal - glam::DVec2::new(500.0, 375.0)).length() < 1e-9, "{camera:?}");
+        assert!((camera.focal - DVec2::new(500.0, 375.0)).length() < 1e-9, "{camera:?}");
     });
-    assert!(lines.contains("9 cameras are of a network's input"), "{lines}");
+    says(&lines, &["9 cameras are of a network's input"]);
     refuses(&of_input(518.0), &["its camera is 518x518", "padded or cropped"]);
 }
 
@@ -158,11 +150,10 @@ fn downscaled_copies_scale_the_camera_and_the_largest_is_used() {
         assert!((camera.focal.x - 0.8 * FOCAL.x).abs() < 1e-9);
     });
     assert_eq!(lines.lines().count(), 1, "{lines}");
-    assert!(lines.contains("those of the same names in images_2 are taken"), "{lines}");
+    says(&lines, &["those of the same names in images_2 are taken"]);
 
     let images = Some(folder.join("images_4"));
-    let options = LoadOptions { images, ..LoadOptions::default() };
-    let dataset = Dataset::load(&folder, &options).unwrap();
+    let dataset = load_with(&folder, LoadOptions { images, ..Default::default() });
     assert_eq!(view(&dataset, "v01").camera.width, 24, "where it is named, that is read");
 }
 
@@ -174,10 +165,10 @@ fn the_photographs_are_read_from_a_given_folder() {
     photographs(&folder, "mine", 0..9, 1.0);
     model(9).write_binary(&root.join("sparse/0"));
     let images = Some(folder.join("mine"));
-    let options = LoadOptions { images, ..LoadOptions::default() };
-    assert_whole(&Dataset::load(&root, &options).unwrap(), "--images");
+    let options = LoadOptions { images, ..Default::default() };
+    assert_whole(&load_with(&root, options), "--images");
     let images = Some(folder.join("absent"));
-    let options = LoadOptions { images, ..LoadOptions::default() };
+    let options = LoadOptions { images, ..Default::default() };
     assert!(Dataset::load(&root, &options).unwrap_err().to_string().contains("absent"));
 }
 
@@ -215,7 +206,7 @@ fn paths_of_another_machine_are_resolved_by_name_with_one_remark() {
             }
             let lines = warnings(|| assert_whole(&load(&folder), before));
             assert_eq!(lines.lines().count(), 1, "{before}: {lines}");
-            assert!(lines.contains("9 of its photographs are not where it lists them"), "{lines}");
+            says(&lines, &["9 of its photographs are not where it lists them"]);
         }
     }
 }
@@ -336,10 +327,9 @@ fn an_archive_is_read_in_place() {
         assert_whole(&load(&zip), prefix);
     }
     // Also photographs that are read again.
-    let options = LoadOptions { keep: Some(0), ..LoadOptions::default() };
-    let dataset = Dataset::load(&zip, &options).unwrap();
+    let dataset = load_with(&zip, LoadOptions { keep: Some(0), ..Default::default() });
     let image = dataset.views[3].loaded().unwrap();
-    assert_eq!(super::level(image.as_deref()), Some(13.0));
+    assert_eq!(level(image.as_deref()), Some(13.0));
     assert_eq!(fs::read_dir(&folder).unwrap().count(), 2, "something was unpacked");
     // Listed files outside the archive are not read.
     let outside = folder.join("outside.png");
@@ -351,8 +341,7 @@ fn an_archive_is_read_in_place() {
     ]);
     write_json(root.join("transforms.json"), &listing);
     pack(&root, &zip, "");
-    let options = LoadOptions { test_every: Some(0), ..LoadOptions::default() };
-    let dataset = Dataset::load(&zip, &options).unwrap();
+    let dataset = load_with(&zip, LoadOptions { test_every: Some(0), ..Default::default() });
     assert_eq!(names(&dataset, Split::Train), ["v02"]);
 
     fs::write(&zip, "no archive").unwrap();
@@ -392,10 +381,7 @@ fn black_borders_of_undistorted_photographs_are_masked_but_not_those_of_a_dark_s
             assert_eq!((mask.weights[0], mask.weights[15 * 40 + 20]), (0.0, 1.0), "{}", view.name);
         }
     });
-    assert!(
-        lines.contains("black in the same place at the border") && lines.contains("masked"),
-        "{lines}"
-    );
+    says(&lines, &["black in the same place at the border", "masked"]);
     // Photographs that are read again are measured without their borders as well.
     let options = LoadOptions::default();
     let (dataset, loaded) = Diagnosis::load(&folder, &options).unwrap();
@@ -403,13 +389,13 @@ fn black_borders_of_undistorted_photographs_are_masked_but_not_those_of_a_dark_s
     assert_eq!(Diagnosis::new(&dataset, &options).unwrap(), loaded);
     {
         let apply = format!("tone apply {} --curve ap3 --json", folder.display());
-        let (report, _) = crate::common::command::run(&apply, 0);
-        let report: serde_json::Value = serde_json::from_str(&report).unwrap();
+        let (report, _) = run(&apply, 0);
+        let report: Value = serde_json::from_str(&report).unwrap();
         let p10 = report["views"]["v00"]["p10"].as_f64().unwrap();
         assert!(p10 > 0.03, "{report}");
     }
-    let options = LoadOptions { mask_borders: false, ..LoadOptions::default() };
-    assert!(Dataset::load(&folder, &options).unwrap().views.iter().all(|view| view.mask.is_none()));
+    let options = LoadOptions { mask_borders: false, ..Default::default() };
+    assert!(load_with(&folder, options).views.iter().all(|view| view.mask.is_none()));
     paint(100.0, 2);
     assert!(load(&folder).views.iter().all(|view| view.mask.is_none()));
 }
@@ -427,11 +413,11 @@ fn references_as_dark_as_the_photographs_are_not_references() {
         for view in dataset.test_views() {
             assert!(view.image.is_some() && view.reference.is_none(), "{}", view.name);
         }
-        let options = LoadOptions { keep: Some(0), downscale: 1.5, ..LoadOptions::default() };
-        let dataset = Dataset::load(root, &options).unwrap();
+        let dataset =
+            load_with(root, LoadOptions { keep: Some(0), downscale: 1.5, ..Default::default() });
         assert!(dataset.test_views().all(|view| view.loaded().unwrap().is_some()));
     });
-    assert!(lines.contains("2 reference images are as dark as the photographs"), "{lines}");
+    says(&lines, &["2 reference images are as dark as the photographs"]);
     // Bright ones are references, and so are those of bright photographs.
     photographs(root, "test", 7..9, 4.0);
     assert!(load(root).test_views().all(|view| view.reference.is_some()));

@@ -1,6 +1,5 @@
 //! Levels of the files of a set: the same for all of its photographs.
 
-use ::image::{ImageBuffer, Rgb};
 use nightsplat_photographs::image::{StoredLight, linear_from_srgb, srgb_from_linear};
 
 use super::*;
@@ -8,7 +7,7 @@ use super::*;
 /// A dataset of 17 photographs in 16 bits, of codes by photograph and pixel.
 fn set(code: impl Fn(usize, u32) -> u16) -> Folder {
     let root = Folder::empty();
-    std::fs::create_dir(root.join("images")).unwrap();
+    fs::create_dir(root.join("images")).unwrap();
     for index in 0..17 {
         let path = root.join("images").join(name(index)).with_extension("png");
         let pixel = |x, y| Rgb([code(index, SIZE.0 * y + x); 3]);
@@ -20,8 +19,7 @@ fn set(code: impl Fn(usize, u32) -> u16) -> Folder {
 
 /// The values of a view's photograph at two pixels.
 fn values(root: &Path, light: Option<StoredLight>, downscale: f64) -> [f32; 2] {
-    let options = LoadOptions { light, downscale, ..LoadOptions::default() };
-    let dataset = Dataset::load(root, &options).unwrap();
+    let dataset = load_with(root, LoadOptions { light, downscale, ..Default::default() });
     let view = view(&dataset, "v02");
     let whole = view.photograph().unwrap().unwrap();
     [0, 77].map(|pixel| whole.data[pixel])
@@ -58,7 +56,7 @@ fn a_photograph_beyond_the_levels_that_others_show_restores_those_of_the_format(
 #[test]
 fn photographs_of_linear_light_are_shrunk_in_light() {
     let root = Folder::empty();
-    std::fs::create_dir(root.join("images")).unwrap();
+    fs::create_dir(root.join("images")).unwrap();
     let light = |x, y| if (x + 3 * y) % 4 == 0 { 0.09 } else { -0.01 };
     for index in 0..9 {
         let path = root.join("images").join(name(index)).with_extension("exr");
@@ -69,8 +67,7 @@ fn photographs_of_linear_light_are_shrunk_in_light() {
     }
     model(9).write_text(&root.join("sparse/0"));
     for keep in [None, Some(0)] {
-        let options = LoadOptions { keep, downscale: 1.25, ..LoadOptions::default() };
-        let dataset = Dataset::load(&root, &options).unwrap();
+        let dataset = load_with(&root, LoadOptions { keep, downscale: 1.25, ..Default::default() });
         let view = view(&dataset, "v03");
         for image in [view.loaded().unwrap().unwrap(), view.photograph().unwrap().unwrap()] {
             assert_eq!((image.width, image.height), (32, 24));

@@ -1,11 +1,6 @@
 //! COLMAP models written by scripts and newer versions.
 
-use std::fs;
-
-use nightsplat_core::camera::{CameraModel, KannalaBrandt};
-
-use super::synthetic::*;
-use super::{load, refuses};
+use super::*;
 
 #[test]
 fn images_with_one_line_each_are_all_read() {

@@ -1,17 +1,6 @@
 //! Photograph files: formats, orientation, alpha and masks.
 
-use std::fs;
-use std::path::Path;
-
-use glam::{DAffine3, DMat3, DVec3};
-use image::{ImageBuffer, Luma, Rgb, Rgba};
-use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
-use nightsplat_photographs::image::{Image, ImageFile, Mask, Orientation};
-use serde_json::json;
-
-use super::synthetic::*;
-use super::{load, names, refuses, view};
-use crate::common::command::{refused, run};
+use super::*;
 
 /// The values of one row of pixels.
 fn row(image: &Image) -> Vec<f32> {
@@ -52,7 +41,7 @@ fn tiff_and_webp_are_read_at_full_precision() {
     // Float images are only read from EXR.
     fs::write(path("float.tif"), float_tiff(&[[0.0; 3], [0.5; 3]])).unwrap();
     let error = Image::load(path("float.tif")).unwrap_err().to_string();
-    assert!(error.contains("float.tif: is not read") && error.contains("EXR"), "{error}");
+    says(&error, &["float.tif: is not read", "EXR"]);
 }
 
 /// A TIFF of one row of colours in 32-bit floats.
@@ -115,13 +104,9 @@ fn heic_is_refused_with_its_converter_and_listed_as_unread() {
     let root = &Folder::empty();
     fs::write(root.join("a.heic"), b"\0\0\0\x18ftypheic\0\0\0\0mif1heic").unwrap();
     photograph(&root.join("b.png"), SIZE, 0.1);
-    refused(
-        &format!("tone apply {}/a.heic", root.display()),
-        3,
-        &["a.heic", "HEIC", "heif-convert", "sips"],
-    );
-    let (_, message) = run(&format!("tone apply {}", root.display()), 0);
-    assert!(message.contains("not read: 1 .heic") && message.contains("heif-convert"), "{message}");
+    root.refused("tone apply @a.heic", 3, &["a.heic", "HEIC", "heif-convert", "sips"]);
+    let (_, message) = root.run("tone apply @", 0);
+    says(&message, &["not read: 1 .heic", "heif-convert"]);
 }
 
 /// A JPEG of one grey with an orientation in its Exif.
@@ -244,16 +229,16 @@ fn masks_are_found_by_both_names_and_may_be_inverted_and_alpha_is_a_mask() {
     assert!(view(&dataset, "v04").mask.is_none());
     let image = view(&dataset, "v00").image.as_ref().unwrap();
     assert_eq!(view(&dataset, "v00").counted(image).len(), 3 * 20 * 30);
-    let inverted = LoadOptions { invert_masks: true, ..LoadOptions::default() };
-    let dataset = Dataset::load(root, &inverted).unwrap();
+    let inverted = LoadOptions { invert_masks: true, ..Default::default() };
+    let dataset = load_with(root, inverted);
     let mask = view(&dataset, "v00").mask.as_ref().unwrap();
     assert_eq!((mask.weights[0], mask.weights[39]), (0.0, 1.0));
     // Alpha is not inverted.
     hides_the_right(view(&dataset, "v03").mask.as_ref().unwrap());
 
     // Resized with the photograph.
-    let shrunk = LoadOptions { downscale: 1.6, ..LoadOptions::default() };
-    let mask = view(&Dataset::load(root, &shrunk).unwrap(), "v00").mask.clone().unwrap();
+    let shrunk = LoadOptions { downscale: 1.6, ..Default::default() };
+    let mask = view(&load_with(root, shrunk), "v00").mask.clone().unwrap();
     // The thirteenth column contains half a masked column.
     assert_eq!((mask.width, mask.weights[11], mask.weights[12]), (25, 1.0, 0.0));
 }
@@ -271,19 +256,19 @@ fn a_mask_of_another_aspect_ratio_is_refused_and_a_full_mask_excludes_its_view()
     );
     half_mask(&root.join("masks/v01.png"), (30, 30));
     refuses(root, &["masks/v01.png: is 30x30, its photograph 40x30"]);
-    refused(&format!("diagnose {}", root.display()), 3, &["masks/v01.png"]);
+    root.refused("diagnose @", 3, &["masks/v01.png"]);
 }
 
 #[test]
 fn masked_pixels_are_not_in_the_statistics_of_tone() {
     let root = &Folder::empty();
-    let measured = |more: &str| -> serde_json::Value {
+    let measured = |more: &str| -> Value {
         let (stdout, _) = run(&format!("tone apply {} --json{more}", root.display()), 0);
         serde_json::from_str(&stdout).unwrap()
     };
     let halves = |x: u32, _| [if 2 * x < SIZE.0 { 0.1 } else { 0.9 }; 3];
     Image::from_fn(SIZE.0, SIZE.1, halves).save_png8(root.join("a.png")).unwrap();
-    let mean = |json: &serde_json::Value| (json["scene"]["mean"].as_f64().unwrap() * 100.0).round();
+    let mean = |json: &Value| (json["scene"]["mean"].as_f64().unwrap() * 100.0).round();
     assert_eq!(mean(&measured("")), 50.0);
     half_mask(&root.join("masks/a.png"), SIZE);
     assert_eq!(mean(&measured("")), 10.0);

@@ -1,10 +1,8 @@
 //! Real captures: committed excerpts, and the full ones if available.
 
-use glam::{DAffine3, DMat3, DVec2, DVec3};
-use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
-
-use super::{level, load, names, view};
 use crate::common::{fixture, shared};
+
+use super::*;
 
 /// The share of points that project into the views that see them.
 fn share_of_points_in_their_views(dataset: &Dataset) -> f64 {
@@ -75,8 +73,7 @@ fn the_lom_scenes_load_with_their_splits_and_points() {
         [("chair", 43, 5, 2267), ("sofa", 29, 4, 800), ("shrub", 30, 5, 8680)]
     {
         let Some(root) = shared(&format!("data/lom/{scene}")) else { continue };
-        let options = LoadOptions { downscale: 2.0, ..LoadOptions::default() };
-        let dataset = Dataset::load(&root, &options).unwrap();
+        let dataset = load_with(&root, LoadOptions { downscale: 2.0, ..Default::default() });
         assert_eq!(
             (dataset.train_views().count(), dataset.test_views().count()),
             (train, test),
@@ -95,8 +92,7 @@ fn the_lom_scenes_load_with_their_splits_and_points() {
 fn realx3d_keeps_its_test_poses() {
     for (scene, train, test) in [("Cupcake", 30, 6), ("GearWorks", 27, 5)] {
         let Some(root) = shared(&format!("data/realx3d/{scene}")) else { continue };
-        let options = LoadOptions { downscale: 8.0, ..LoadOptions::default() };
-        let dataset = Dataset::load(&root, &options).unwrap();
+        let dataset = load_with(&root, LoadOptions { downscale: 8.0, ..Default::default() });
         assert_eq!(
             (dataset.train_views().count(), dataset.test_views().count()),
             (train, test),
@@ -112,8 +108,7 @@ fn realx3d_keeps_its_test_poses() {
 #[test]
 fn twenty_three_cameras_of_different_sizes_load_in_one_dataset() {
     let Some(root) = shared("data/fixtures/colmap_multi_camera") else { return };
-    let options = LoadOptions { downscale: 4.0, ..LoadOptions::default() };
-    let dataset = Dataset::load(&root, &options).unwrap();
+    let dataset = load_with(&root, LoadOptions { downscale: 4.0, ..Default::default() });
     assert_eq!((dataset.views.len(), dataset.points.len()), (23, 1443));
     assert_eq!(dataset.test_views().count(), 3);
     let mut sizes: Vec<_> =
@@ -128,13 +123,11 @@ fn twenty_three_cameras_of_different_sizes_load_in_one_dataset() {
 fn the_fox_splits_by_its_list_and_scores_against_normal_light() {
     let Some(root) = shared("data/fox") else { return };
     let dataset = load(&root);
-    let listed = std::fs::read_to_string(root.join("test.txt")).unwrap();
+    let listed = fs::read_to_string(root.join("test.txt")).unwrap();
     let listed: Vec<_> = listed.lines().map(|line| line.trim_end_matches(".png")).collect();
     assert_eq!((dataset.views.len(), names(&dataset, Split::Test)), (50, listed.clone()));
     let test = view(&dataset, listed[0]);
-    let mean = |image: &nightsplat_photographs::image::Image| {
-        image.data.iter().sum::<f32>() / image.data.len() as f32
-    };
+    let mean = |image: &Image| image.data.iter().sum::<f32>() / image.data.len() as f32;
     let (low, normal) =
         (mean(test.image.as_ref().unwrap()), mean(test.reference.as_ref().unwrap()));
     assert!(low < 0.5 * normal, "{low} is not dark beside {normal}");

@@ -1,12 +1,13 @@
 //! A small capture on a ring of cameras, written in every supported layout.
 
 use std::fs;
-use std::ops::Deref;
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use nightsplat_photographs::image::{Image, ImageFile};
 use serde_json::{Value, json};
+
+pub(crate) use crate::common::command::Folder;
 
 pub(crate) const SIZE: (u32, u32) = (40, 30);
 pub(crate) const FOCAL: DVec2 = DVec2::new(35.0, 36.0);
@@ -85,28 +86,7 @@ pub(crate) fn write_json(path: impl AsRef<Path>, value: &Value) {
     fs::write(path, serde_json::to_string_pretty(value).unwrap()).unwrap();
 }
 
-/// A folder for a dataset, removed when it is dropped.
-pub(crate) struct Folder(tempfile::TempDir);
-
-impl Deref for Folder {
-    type Target = Path;
-
-    fn deref(&self) -> &Path {
-        self.0.path()
-    }
-}
-
-impl AsRef<Path> for Folder {
-    fn as_ref(&self) -> &Path {
-        self
-    }
-}
-
 impl Folder {
-    pub(crate) fn empty() -> Self {
-        Self(tempfile::tempdir().unwrap())
-    }
-
     /// A COLMAP model in `sparse/0`, and its photographs in `images`.
     pub(crate) fn with_model(model: &Model) -> Self {
         let folder = Self::empty();

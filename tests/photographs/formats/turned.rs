@@ -1,19 +1,11 @@
 //! Photographs that their Exif turns by half or mirrors, and square ones: their size does not tell which pixels their
 //! cameras are of.
 
-use std::fs;
-use std::path::Path;
-
-use glam::{DVec2, DVec3};
-use image::{ImageBuffer, Luma};
-use nightsplat_photographs::dataset::{Dataset, LoadOptions, PixelOrientation};
-use nightsplat_photographs::image::{Image, Orientation};
+use nightsplat_photographs::dataset::PixelOrientation;
 
 use super::photographs::orient;
-use super::synthetic::*;
-use super::view;
-use crate::common::command::run;
-use crate::common::log::warnings;
+
+use super::*;
 
 const VIEWS: usize = 9;
 const WIDE: (u32, u32) = (160, 120);
@@ -81,7 +73,7 @@ fn capture(root: &Path, size: (u32, u32), turn: (u8, u8), of_exif: bool, has_poi
         let stored = if of_exif { turned(image, turn.1) } else { image };
         write(&stored, &path);
         orient(&path, turn.0);
-        let (q, t) = (glam::DQuat::from_mat3(&pose(index).matrix3), pose(index).translation);
+        let (q, t) = (DQuat::from_mat3(&pose(index).matrix3), pose(index).translation);
         let numbers = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|number| number.to_string());
         images += &format!("{} {} 1 {}.jpg\n\n", index + 1, numbers.join(" "), name(index));
     }
@@ -113,8 +105,8 @@ fn turned(image: Image, orientation: u8) -> Image {
 
 fn loaded(root: &Path, orientation: PixelOrientation) -> (Dataset, String) {
     let mut dataset = None;
-    let options = LoadOptions { orientation, ..LoadOptions::default() };
-    let message = warnings(|| dataset = Some(Dataset::load(root, &options).unwrap()));
+    let options = LoadOptions { orientation, ..Default::default() };
+    let message = warnings(|| dataset = Some(load_with(root, options)));
     (dataset.unwrap(), message)
 }
 
@@ -155,7 +147,7 @@ fn without_points_what_is_stored_is_taken_with_one_warning_and_the_option_says_o
         assert_eq!(are_right(&dataset, WIDE), !of_exif);
         let expected = "Exif turns or mirrors 9 photographs, v00 the first";
         assert_eq!(message.matches(expected).count(), 1, "{message}");
-        assert!(message.contains("--orientation exif"), "{message}");
+        says(&message, &["--orientation exif"]);
         let options = [(PixelOrientation::Stored, !of_exif), (PixelOrientation::Exif, of_exif)];
         for (option, is_right) in options {
             let (dataset, message) = loaded(root, option);
@@ -198,7 +190,7 @@ fn the_configuration_keeps_the_option() {
     let line = format!("train {} --out {}/run --explain", root.display(), root.display());
     let (explained, _) = run(&format!("{line} --orientation exif"), 0);
     let kept = explained.lines().find(|line| line.contains("orientation")).unwrap();
-    assert!(kept.contains("exif") && kept.contains("--orientation"), "{kept}");
+    says(&kept, &["exif", "--orientation"]);
     let (_, refused) = run(&format!("{line} --orientation upright"), 2);
-    assert!(refused.contains("auto, stored, exif"), "{refused}");
+    says(&refused, &["auto, stored, exif"]);
 }

@@ -1,17 +1,12 @@
-//! Gaussians in host memory, and density control of them on the device and in its references.
+//! Gaussians in host memory, and density control of them on the device.
 
-use glam::{DAffine3, DVec2, DVec3, Vec3};
-use nightsplat::gpu::{Gpu, Reference};
-use nightsplat::kernels::densify_action::{KEY_KEEP, KEY_PRUNE};
-use nightsplat::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
 use nightsplat::splats::batches::Batches;
 use nightsplat::splats::densify::{
-    Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, LARGEST_CHANGE, Round,
+    Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, Round,
 };
-use nightsplat::splats::optimizer::Moments;
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::splats::scene::{DeviceGaussians, Features, GaussianSlice, Layout, Shape, width};
-use nightsplat_core::camera::{Camera, CameraModel, Patch};
+use nightsplat::splats::scene::{DeviceGaussians, GaussianSlice, width};
+
+use crate::common::prelude::*;
 
 /// Four features and SH of degree 1.
 pub(super) const COLUMNS: usize = 27;
@@ -84,6 +79,12 @@ impl Host {
             grad_norm_sums: vec![0.0; count],
             visit_counts: vec![4; count],
         }
+    }
+
+    /// Calm ones whose gradients grow with their numbers.
+    pub(super) fn ranked(count: usize) -> Self {
+        let grad_norm_sums = (0..count).map(|i| 0.1 + i as f32).collect();
+        Self { grad_norm_sums, ..Self::calm(count) }
     }
 
     /// Large and small, faint and opaque Gaussians with gradients of all sizes; some were never visible.
@@ -191,124 +192,5 @@ impl Host {
             visit_counts: vec![0; report.count],
         };
         (host, report)
-    }
-
-    /// The same in the references, with sort and prefix sums on the host.
-    pub(super) fn reference(
-        &self,
-        cameras: &[Camera],
-        settings: DensifySettings,
-        round: Round,
-    ) -> Self {
-        let conserving = settings.control == DensityControl::Conserving;
-        let cameras = if conserving { cameras } else { &[] };
-        let cameras: Vec<kernels::Camera> =
-            cameras.iter().map(|camera| (&Patch::from(camera)).into()).collect();
-        let n = self.count;
-        let (gaussian_count, column_count, feature_count) =
-            (n as u32, COLUMNS as u32, FEATURES as u32);
-        let (mut keys, mut ids, mut counters) = (vec![0; n], vec![0; n], vec![0; 4]);
-        let params = densify_score::Params {
-            gaussian_count,
-            column_count,
-            feature_count,
-            gradient_threshold: settings.gradient_threshold as f32,
-            min_raw_opacity: (settings.min_opacity / (1.0 - settings.min_opacity)).ln() as f32,
-            first_gaussian: 0,
-            camera_count: cameras.len() as u32,
-            near: settings.near as f32,
-            largest_change: LARGEST_CHANGE,
-        };
-        let slices = densify_score::Slices {
-            parameters: &self.parameters,
-            grad_norm_sums: &self.grad_norm_sums,
-            visit_counts: &self.visit_counts,
-            keys: &mut keys,
-            ids: &mut ids,
-            counters: &mut counters,
-            cameras: &cameras,
-        };
-        densify_score::Kernel::run(&params, &densify_score::Constants::default(), slices);
-        assert_eq!(counters[0] as usize, keys.iter().filter(|&&key| key < KEY_KEEP).count());
-        assert_eq!(counters[1] as usize, keys.iter().filter(|&&key| key == KEY_PRUNE).count());
-        ids.sort_by_key(|&id| keys[id as usize]);
-        keys.sort_unstable();
-        let (mut actions, mut child_counts) = (vec![0; n], vec![0; n]);
-        let params = densify_decide::Params {
-            gaussian_count,
-            first_gaussian: 0,
-            batch_count: gaussian_count,
-            max_gaussians: settings.max_gaussians.min(u32::MAX as usize) as u32,
-            rounds_left: round.rounds_left as u32,
-            split_log_scale: settings.split_scale.ln() as f32,
-            max_added: u32::MAX,
-        };
-        let slices = densify_decide::Slices {
-            parameters: &self.parameters,
-            sorted_keys: &keys,
-            sorted_ids: &ids,
-            counters: &mut counters,
-            actions: &mut actions,
-            child_counts: &mut child_counts,
-        };
-        densify_decide::Kernel::run(&params, &densify_decide::Constants { conserving }, slices);
-        let mut count = 0;
-        let offsets: Vec<u32> = child_counts
-            .iter()
-            .map(|child_count| {
-                count += child_count;
-                count - child_count
-            })
-            .collect();
-        let new_gaussian_count = count;
-        let count = count as usize;
-        let mut new_parameters = vec![0.0; count * COLUMNS];
-        let params = densify_scatter::Params {
-            gaussian_count,
-            new_gaussian_count,
-            column_count,
-            feature_count,
-            seed: settings.seed as u32,
-            step: round.step as u32,
-            first_gaussian: 0,
-            first_new_gaussian: 0,
-        };
-        let slices = densify_scatter::Slices {
-            parameters: &self.parameters,
-            actions: &actions,
-            offsets: &offsets,
-            new_parameters: &mut new_parameters,
-        };
-        densify_scatter::Kernel::run(
-            &params,
-            &densify_scatter::Constants { conserving, rest_by_column: false },
-            slices,
-        );
-        let carry = |moments: &[f32]| {
-            let mut new_moments = vec![0.0_f32; count * COLUMNS];
-            let params = densify_moments::Params {
-                gaussian_count,
-                new_gaussian_count,
-                column_count,
-                feature_count,
-                first_new_gaussian: 0,
-            };
-            let slices = densify_moments::Slices {
-                moments: bytemuck::cast_slice(moments),
-                actions: &actions,
-                offsets: &offsets,
-                new_moments: bytemuck::cast_slice_mut(&mut new_moments),
-            };
-            densify_moments::Kernel::run(&params, &densify_moments::Constants::default(), slices);
-            new_moments
-        };
-        Self {
-            count,
-            parameters: new_parameters,
-            first: carry(&self.first),
-            second: carry(&self.second),
-            grad_norm_sums: vec![0.0; count],
-            visit_counts: vec![0; count],
-        }
     }
 }

@@ -1,0 +1,65 @@
+//! What most tests use.
+#![allow(unused_imports, reason = "no test binary uses everything")]
+
+pub(crate) use std::collections::BTreeMap;
+pub(crate) use std::collections::BTreeSet;
+pub(crate) use std::fs;
+pub(crate) use std::path::Path;
+pub(crate) use std::path::PathBuf;
+pub(crate) use std::process::Command;
+pub(crate) use std::process::Stdio;
+pub(crate) use std::sync::OnceLock;
+pub(crate) use std::time::Duration;
+pub(crate) use std::time::Instant;
+
+pub(crate) use glam::DAffine3;
+pub(crate) use glam::DMat3;
+pub(crate) use glam::DQuat;
+pub(crate) use glam::DVec2;
+pub(crate) use glam::DVec3;
+pub(crate) use glam::UVec2;
+pub(crate) use glam::Vec2;
+pub(crate) use glam::Vec3;
+pub(crate) use nightsplat::gpu::Gpu;
+pub(crate) use nightsplat::gpu::Threads;
+pub(crate) use nightsplat::gpu::testing::gpu;
+pub(crate) use nightsplat::gpu::testing::gpu_with;
+pub(crate) use nightsplat::networks::DenoiserSettings;
+pub(crate) use nightsplat::networks::NetworkVariant;
+pub(crate) use nightsplat::reference::gaussian::Gaussian;
+pub(crate) use nightsplat::splats::optimizer::Moments;
+pub(crate) use nightsplat::splats::packed_sh::StorageFormat;
+pub(crate) use nightsplat::splats::render::RenderOptions;
+pub(crate) use nightsplat::splats::render::RenderSettings;
+pub(crate) use nightsplat::splats::render::Renderer;
+pub(crate) use nightsplat::splats::scene::Features;
+pub(crate) use nightsplat::splats::scene::Gaussians;
+pub(crate) use nightsplat::splats::scene::Layout;
+pub(crate) use nightsplat::splats::scene::Shape;
+pub(crate) use nightsplat::splats::scene::ply;
+pub(crate) use nightsplat::targets::pseudo_gt::PseudoGt;
+pub(crate) use nightsplat::train::TrainConfig;
+pub(crate) use nightsplat::train::Trainer;
+pub(crate) use nightsplat_core::camera::Camera;
+pub(crate) use nightsplat_core::camera::CameraModel;
+pub(crate) use nightsplat_core::random::Stream;
+pub(crate) use nightsplat_photographs::dataset::Dataset;
+pub(crate) use nightsplat_photographs::dataset::Split;
+pub(crate) use nightsplat_photographs::image::Image;
+pub(crate) use nightsplat_photographs::image::ImageFile;
+pub(crate) use nightsplat_photographs::image::linear_from_srgb;
+pub(crate) use nightsplat_photographs::metrics::Scores;
+pub(crate) use nightsplat_photographs::tone::Statistics;
+pub(crate) use nightsplat_photographs::tone::ToneCurve;
+pub(crate) use nightsplat_photographs::tone::ToneSettings;
+pub(crate) use nightsplat_synth::Capture;
+pub(crate) use nightsplat_synth::SyntheticOptions;
+pub(crate) use serde_json::Value;
+
+pub(crate) use crate::common::Random;
+pub(crate) use crate::common::assert_close;
+pub(crate) use crate::common::setup::Setup;
+pub(crate) use crate::common::shared;
+pub(crate) use crate::common::train::advance;
+pub(crate) use crate::common::train::small_set;
+pub(crate) use crate::common::workspace::Workspace;
