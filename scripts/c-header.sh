@@ -16,7 +16,7 @@ fi
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 # One file in the order of the header. What Rust callers must promise, C programmers read from the types.
-for part in error device camera model instance render train; do
+for part in error device camera model instance image renderer render train; do
     awk '/^\/\/!/ || /^#\[(cfg|path)/ || /^mod / { next }
         /^ *\/\/\/ # Safety/ { skips = 1 }
         !/^ *\/\/\// { skips = 0 }

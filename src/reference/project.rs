@@ -190,8 +190,9 @@ impl<'a> ProjectionInputs<'a> {
         }
         let (size, camera) = (camera.size, ReferenceCamera::from(&camera));
         let lamp = constants.lamp.then(|| ReferenceLamp::from_numbers(lamp));
-        let first =
-            instance.map_or(0, |instance| (instance.first + params.first_gaussian) as usize);
+        let first = instance.map_or(0, |instance| {
+            (instance.first + params.first_gaussian - params.first_splat) as usize
+        });
         let tint = instance.map_or(DVec4::ONE, |instance| Vec4::from(instance.tint).as_dvec4());
         Self { params, constants, size, camera, lamp, planes, instance, first, tint }
     }
@@ -202,6 +203,12 @@ impl<'a> ProjectionInputs<'a> {
             let mean = gaussian.mean.as_vec3();
             !(mean.cmpge(instance.box_min).all() && mean.cmple(instance.box_max).all())
         })
+    }
+
+    /// The depth of a Gaussian in the order that several views share.
+    fn shared_depth(&self, gaussian: &Gaussian) -> f64 {
+        let axis = Vec4::from(self.params.sort_axis).as_dvec4();
+        axis.dot(self.camera.view(gaussian.mean).extend(1.0))
     }
 
     fn project(&self, gaussian: &Gaussian) -> Option<Projection> {
@@ -217,6 +224,15 @@ impl<'a> ProjectionInputs<'a> {
         let tinted = Gaussian { raw_opacity, ..gaussian.clone() };
         let projection = project_gaussian(&self.camera, settings, &tinted)?;
         Some(Projection { color: self.tint.truncate() * projection.color, ..projection })
+    }
+
+    /// The error bound of its key: the depth is a sum of products of a few times the distance.
+    fn shared_key_error(&self, gaussian: &Gaussian) -> f64 {
+        let nearest = self.params.near.max(NEAREST as f32);
+        let depth = (self.shared_depth(gaussian) as f32).max(nearest);
+        let far = gaussian.mean.length() + self.camera.center().length();
+        let scale = self.camera.rotation.x_axis.length().max(1.0);
+        key_error(depth, 64.0 * UNIT * far * scale)
     }
 
     /// The error bound of each of [`Projection::numbers`]: the kernel computes them for a Gaussian that is off by a few
@@ -330,13 +346,19 @@ impl Reference for Kernel {
                 let i = scene.first + k;
                 let first =
                     if constants.instances { params.first_splat } else { params.first_gaussian };
-                ids[i] = first + i as u32;
-                depth_keys[i] = CULLED;
+                let orders = !constants.shares_sort || params.keeps_order == 0;
+                if orders {
+                    ids[i] = first + i as u32;
+                    depth_keys[i] = CULLED;
+                }
                 tile_counts[i] = 0;
                 if k >= scene.planes.count {
                     continue;
                 }
                 let gaussian = planes.load(&floats, k);
+                if constants.shares_sort && orders {
+                    depth_keys[i] = depth_key(scene.shared_depth(&gaussian) as f32, params.near);
+                }
                 if scene.is_clipped(&gaussian) {
                     continue;
                 }
@@ -349,7 +371,7 @@ impl Reference for Kernel {
                     *color = value as f32;
                 }
                 tile_counts[i] = tile_count(scene.size, constants, &splats[i]);
-                if tile_counts[i] > 0 {
+                if tile_counts[i] > 0 && !constants.shares_sort {
                     depth_keys[i] = depth_key(projection.depth as f32, params.near);
                 }
             }
@@ -369,13 +391,16 @@ impl Reference for Kernel {
             for k in 0..scene.planes.count {
                 let i = scene.first + k;
                 let gaussian = planes.load(&floats, k);
+                let shared = constants.shares_sort.then(|| scene.shared_key_error(&gaussian));
+                depth_keys[i] = shared.unwrap_or_default();
                 if scene.is_clipped(&gaussian) {
                     continue;
                 }
                 let Some(errors) = scene.errors(&gaussian) else {
                     splats[8 * i..][..8].fill(f64::INFINITY);
                     colors[stored * i..][..stored].fill(f64::INFINITY);
-                    (depth_keys[i], tile_counts[i]) = (f64::INFINITY, f64::INFINITY);
+                    tile_counts[i] = f64::INFINITY;
+                    depth_keys[i] = shared.unwrap_or(f64::INFINITY);
                     continue;
                 };
                 let Some(projection) = scene.project(&gaussian) else { continue };
@@ -388,9 +413,10 @@ impl Reference for Kernel {
                 let count = tile_count(scene.size, constants, &splat);
                 let [fewest, most] = scene.tile_counts(&splat, &errors);
                 tile_counts[i] = (count - count.min(fewest)).max(most.max(count) - count).into();
-                depth_keys[i] = match (fewest, most) {
-                    (_, 0) => 0.0,
-                    (0, _) => f64::INFINITY,
+                depth_keys[i] = match (shared, fewest, most) {
+                    (Some(error), ..) => error,
+                    (_, _, 0) => 0.0,
+                    (_, 0, _) => f64::INFINITY,
                     _ => key_error(projection.depth as f32, errors[11]),
                 };
             }

@@ -18,6 +18,7 @@ mod context;
 #[cfg(feature = "train")]
 mod depths;
 mod draw;
+mod eyes;
 #[cfg(feature = "train")]
 mod gradients;
 mod images;
@@ -50,6 +51,7 @@ use buffers::color_floats;
 pub use cameras::{Viewpoint, Viewpoints};
 pub use draw::Drawn;
 use draw::HostTargets;
+use eyes::DepthOrder;
 #[cfg(feature = "train")]
 pub(crate) use gradients::ViewGradients;
 pub use instances::Instance;
@@ -218,11 +220,10 @@ impl Renderer {
         viewpoint: impl Into<Viewpoint<'a>>,
         options: &RenderOptions,
     ) -> Result<()> {
-        self.record_forward(pass, gaussians.into(), viewpoint, options, None, None)
+        self.record_forward(pass, gaussians.into(), viewpoint, options, None)
     }
 
-    /// Records a render. `depths`: the last channel is the depth in the view. `capacity`: intersections beyond it are
-    /// left out, the farthest first; without it they are an overflow.
+    /// Records a render. `depths`: the last channel is the depth in the view.
     fn record_forward<'a>(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -230,20 +231,20 @@ impl Renderer {
         viewpoint: impl Into<Viewpoint<'a>>,
         options: &RenderOptions,
         depths: Option<DepthChannel>,
-        capacity: Option<u32>,
     ) -> Result<()> {
         let viewpoint = viewpoint.into();
         self.check(&gaussians.layout)?;
-        let view = self.view(&viewpoint, depths.is_some())?;
+        let view = self.view(&viewpoint, depths.is_some(), DepthOrder::Own)?;
         let gaussian_count = (self.context_count() + gaussians.layout.count) as u32;
         if viewpoint.on_device.is_none() {
             pass.update(&mut self.frame.camera, &[(&viewpoint.patch).into()])?;
         }
         self.record_project(pass, gaussians, &view, options.sh_degree)?;
-        self.record_splats(pass, gaussian_count, &view, options, depths, capacity)
+        self.record_splats(pass, gaussian_count, &view, options, depths, None)
     }
 
-    /// Records what follows the projection of the Gaussians of a view.
+    /// Records what follows the projection of the Gaussians of a view. `capacity`: intersections beyond it are left
+    /// out, the farthest first; without it they are an overflow.
     fn record_splats(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -304,7 +305,8 @@ impl Renderer {
         d_render: &Buffer<f32>,
         gradients: Gradients<'_>,
     ) -> Result<()> {
-        let (gaussians, view) = (gaussians.into(), self.view(&viewpoint.into(), false)?);
+        let view = self.view(&viewpoint.into(), false, DepthOrder::Own)?;
+        let gaussians = gaussians.into();
         self.check(&gaussians.layout)?;
         let project_backward = self.projections[&view.kind].backward.as_ref();
         let (Some(blend_backward), Some(project_backward)) =
@@ -414,7 +416,12 @@ impl Renderer {
         size.saturating_add(tile - 1) / tile
     }
 
-    fn view<'a>(&mut self, viewpoint: &Viewpoint<'a>, view_depths: bool) -> Result<KernelView<'a>> {
+    fn view<'a>(
+        &mut self,
+        viewpoint: &Viewpoint<'a>,
+        view_depths: bool,
+        order: DepthOrder,
+    ) -> Result<KernelView<'a>> {
         let Viewpoint { patch, on_device } = viewpoint;
         let tiles = self.tiles(patch.size);
         let channels = self.settings.channels() + usize::from(view_depths);
@@ -428,18 +435,20 @@ impl Renderer {
             return Err(Error::Usage(what));
         }
         let camera_model = model_number(&patch.camera.model);
-        let kind = ProjectionKind { camera_model, view_depths, instances: None };
+        let shares_sort = order.is_shared();
+        let kind = ProjectionKind { camera_model, view_depths, instances: None, shares_sort };
         self.build_projections(kind)?;
         let (cameras, camera_index) = on_device.unzip();
         let camera_index = camera_index.unwrap_or_default();
         let (size, half_view) = (patch.size, patch.half_view());
-        Ok(KernelView { kind, channels, cameras, camera_index, size, half_view, tiles })
+        Ok(KernelView { kind, order, channels, cameras, camera_index, size, half_view, tiles })
     }
 }
 
 /// A viewpoint as the kernels take it, and the columns and rows of tiles of its image.
 struct KernelView<'a> {
     kind: ProjectionKind,
+    order: DepthOrder,
     /// Values per pixel.
     channels: usize,
     /// `None`: the renderer's own.

@@ -2,6 +2,7 @@
 
 #![expect(unsafe_code, reason = "plays a host application, which calls Vulkan itself")]
 
+mod eyes;
 mod frames;
 mod instances;
 mod kernels;

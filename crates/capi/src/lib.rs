@@ -9,7 +9,9 @@
 //! - `model`: Gaussians on it
 //! - `camera`: cameras, also from an engine's matrices
 //! - `instance`: models of a render of several
-//! - `render`: renders recorded into a host's images
+//! - `image`: a host's images
+//! - `renderer`: what renders, and what its frames have become
+//! - `render`: renders recorded into images
 //! - `train`: training on it
 
 #![expect(unsafe_code, reason = "pointers of C")]
@@ -17,8 +19,10 @@
 pub mod camera;
 pub mod device;
 pub mod error;
+pub mod image;
 pub mod instance;
 pub mod model;
 pub mod render;
+pub mod renderer;
 pub mod structs;
 pub mod train;

@@ -58,6 +58,11 @@
 // `pick` is a pixel of the first camera, of which `nsp_renderer_picked` tells what is there.
 #define NSP_RENDER_PICK 64
 
+// All cameras have one sort, by the depth along the mean of their axes: pinholes or orthographic, which look at most
+// 30 degrees beside it. Where their axes are parallel, the pictures are the same; else splats that intersect may
+// change their order.
+#define NSP_RENDER_ONE_SORT 128
+
 // A device. Any thread may use it.
 typedef struct NspDevice NspDevice;
 
@@ -206,6 +211,40 @@ typedef struct NspModelInfo {
     double origin[3];
 } NspModelInfo;
 
+// The outcome of the newest frame that is done.
+typedef struct NspStatus {
+    // `sizeof(NspStatus)`.
+    size_t struct_size;
+    // The number of the frame; 0: none is done yet.
+    uint64_t frame;
+    // Intersections of splats and tiles, in the view that has the most.
+    uint32_t intersections;
+    // The intersections that memory and budget allowed.
+    uint32_t capacity;
+    // The intersections that were left out, the farthest.
+    uint32_t left_out;
+    // The splats of the fullest tile if the device cannot process that many, and the tile is not drawn; else 0.
+    uint32_t splats_per_tile;
+    // Bytes of device memory in use by all objects of the device.
+    uint64_t device_bytes;
+} NspStatus;
+
+// What the newest pick that is done found.
+typedef struct NspPick {
+    // `sizeof(NspPick)`.
+    size_t struct_size;
+    // The number of its frame; 0: none is done yet.
+    uint64_t frame;
+    // 1: a splat blocks half of the light, with those before it; 0: none does, and the rest is 0.
+    uint32_t is_hit;
+    // The index in `NspRender::instances`; 0 where a model is drawn.
+    uint32_t instance;
+    // The index of the splat's Gaussian in its model.
+    uint32_t gaussian;
+    // Its depth in the view, world units.
+    float depth;
+} NspPick;
+
 // The state of an image before or after a recording.
 typedef struct NspImageState {
     // The image layout.
@@ -327,40 +366,6 @@ typedef struct NspRender {
     // With the principal point of this frame's, a jitter is left out.
     const struct NspCamera *cameras_before;
 } NspRender;
-
-// The outcome of the newest frame that is done.
-typedef struct NspStatus {
-    // `sizeof(NspStatus)`.
-    size_t struct_size;
-    // The number of the frame; 0: none is done yet.
-    uint64_t frame;
-    // Intersections of splats and tiles, in the view that has the most.
-    uint32_t intersections;
-    // The intersections that memory and budget allowed.
-    uint32_t capacity;
-    // The intersections that were left out, the farthest.
-    uint32_t left_out;
-    // The splats of the fullest tile if the device cannot process that many, and the tile is not drawn; else 0.
-    uint32_t splats_per_tile;
-    // Bytes of device memory in use by all objects of the device.
-    uint64_t device_bytes;
-} NspStatus;
-
-// What the newest pick that is done found.
-typedef struct NspPick {
-    // `sizeof(NspPick)`.
-    size_t struct_size;
-    // The number of its frame; 0: none is done yet.
-    uint64_t frame;
-    // 1: a splat blocks half of the light, with those before it; 0: none does, and the rest is 0.
-    uint32_t is_hit;
-    // The index in `NspRender::instances`; 0 where a model is drawn.
-    uint32_t instance;
-    // The index of the splat's Gaussian in its model.
-    uint32_t gaussian;
-    // Its depth in the view, world units.
-    float depth;
-} NspPick;
 
 // A training step. Experimental.
 typedef struct NspStep {
@@ -516,13 +521,6 @@ NspResult nsp_renderer_create(struct NspDevice *device, const struct NspModel *m
 // Allocates memory for views of this size and for this many intersections, ahead of the first recording.
 NspResult nsp_renderer_reserve(struct NspRenderer *renderer, uint32_t width, uint32_t height, uint32_t intersections);
 
-// Records the render of a model, or of `NspRender::instances` if `model` is NULL. Nothing is submitted, and nothing is
-// waited for. If the view needs more memory than there is, the nearest splats are drawn, and a later call allocates
-// more.
-//
-// It binds compute pipelines, descriptor set 0 and push constants, and restores none of them.
-NspResult nsp_record_render(struct NspRenderer *renderer, const struct NspModel *model, const struct NspRender *render);
-
 // Writes the outcome of the newest frame that is done to `status`. It never waits.
 NspResult nsp_renderer_status(const struct NspRenderer *renderer, struct NspStatus *status);
 
@@ -531,6 +529,13 @@ NspResult nsp_renderer_picked(const struct NspRenderer *renderer, struct NspPick
 
 // Destroys a renderer; frames that use it may be in flight.
 void nsp_renderer_destroy(struct NspRenderer *renderer);
+
+// Records the render of a model, or of `NspRender::instances` if `model` is NULL. Nothing is submitted, and nothing is
+// waited for. If the view needs more memory than there is, the nearest splats are drawn, and a later call allocates
+// more.
+//
+// It binds compute pipelines, descriptor set 0 and push constants, and restores none of them.
+NspResult nsp_record_render(struct NspRenderer *renderer, const struct NspModel *model, const struct NspRender *render);
 
 // Creates a watch. `progress` is called with a stage, such as "decoding photographs" or "training", how much of it is
 // done, and all of it: from any thread, by one at a time. It may call `nsp_watch_stop`, and nothing else of the

@@ -2,86 +2,21 @@
 
 use ash::vk;
 use ash::vk::Handle as _;
-pub use ash::vk::{
-    AccessFlags2 as VkAccessFlags2, Extent2D as VkExtent2D, Format as VkFormat, Image as VkImage,
-    ImageLayout as VkImageLayout, PipelineStageFlags2 as VkPipelineStageFlags2,
-};
-use nightsplat::gpu::{Gpu, HostFrame, HostImage, ImageFormat, ImageState};
+use nightsplat::gpu::{HostFrame, ImageFormat};
 use nightsplat::splats::render::{
-    DepthConvention, DepthKind, Drawn, Instance, Motion, Pick, PickedSplat, Purpose, RenderOptions,
-    RenderSettings, Renderer, SceneDepth, Target,
+    DepthConvention, DepthKind, Instance, Motion, RenderOptions, SceneDepth, Target,
 };
 use nightsplat::splats::scene::MAX_SH_DEGREE;
 use nightsplat_core::camera::Camera;
 
 use super::camera::NspCamera;
-use super::device::{NspDevice, VkCommandBuffer};
-use super::error::{Failure, NspResult, Object, guard};
+use super::device::VkCommandBuffer;
+use super::error::{Failure, NspResult, guard};
+use super::image::{NspImage, lent};
 use super::instance::{NspInstance, lent_instance};
-use super::model::{Appearance, LoadedModel, NspModel, appearance, check_device};
-use super::structs::{Sized0, destroy, give, object, object_mut, read, read_all, write};
-
-/// A renderer: compiled kernels, and memory that grows with the views. Use it from one thread at a time.
-#[derive(Debug)]
-pub struct NspRenderer(Object<Shown>);
-
-#[derive(Debug)]
-struct Shown {
-    gpu: Gpu,
-    renderer: Renderer,
-    sh_degree: u32,
-    /// Of the model that it was made for, as below.
-    gaussian_count: usize,
-    appearance: Appearance,
-}
-
-/// The state of an image before or after a recording.
-#[repr(C)]
-#[derive(Clone, Copy, Debug)]
-pub struct NspImageState {
-    /// The image layout.
-    pub layout: VkImageLayout,
-    /// The queue family that owns the image; read if `is_owned`.
-    pub family: u32,
-    /// The pipeline stages in which the host uses the image.
-    pub stages: VkPipelineStageFlags2,
-    /// The host's accesses in these stages.
-    pub access: VkAccessFlags2,
-    /// 1: `family` owns the image, and if it is not the lent family, the library's half of the ownership transfer is
-    /// recorded; 0: ownership is not transferred.
-    pub is_owned: u32,
-    /// Unused.
-    pub reserved: u32,
-}
-
-/// An array layer of an image: mip level 0, single-sampled. Its usage includes `TRANSFER_DST` if it is written, and
-/// `TRANSFER_SRC` if it is read.
-#[repr(C)]
-#[derive(Clone, Copy, Debug)]
-pub struct NspImage {
-    /// `sizeof(NspImage)`.
-    pub struct_size: usize,
-    /// The image.
-    pub image: VkImage,
-    /// Its format.
-    pub format: VkFormat,
-    /// Width and height in pixels, at least those of the cameras.
-    pub extent: VkExtent2D,
-    /// The array layer of the first camera.
-    pub layer: u32,
-    /// The number of array layers; 0 stands for 1.
-    pub layers: u32,
-    /// The state in which the host leaves the image.
-    pub before: NspImageState,
-    /// The state after the render.
-    pub after: NspImageState,
-}
-
-// SAFETY: the size comes first; null handles are zeros.
-unsafe impl Sized0 for NspImage {
-    const NAME: &'static str = "NspImage";
-    const FIRST_SIZE: usize = size_of::<Self>();
-}
+use super::model::{LoadedModel, NspModel, check_device};
+use super::renderer::{NspRenderer, Shown};
+use super::structs::{Sized0, object, object_mut, read, read_all};
 
 /// Blends over the contents of `color` instead of replacing them.
 pub const NSP_RENDER_OVER: u32 = 1;
@@ -102,8 +37,14 @@ pub const NSP_RENDER_PHOTOGRAPH: u32 = 32;
 /// `pick` is a pixel of the first camera, of which `nsp_renderer_picked` tells what is there.
 pub const NSP_RENDER_PICK: u32 = 64;
 
+/// All cameras have one sort, by the depth along the mean of their axes: pinholes or orthographic, which look at most
+/// 30 degrees beside it. Where their axes are parallel, the pictures are the same; else splats that intersect may
+/// change their order.
+pub const NSP_RENDER_ONE_SORT: u32 = 128;
+
 const FLAGS: u32 = NSP_RENDER_OVER
     | NSP_RENDER_PICK
+    | NSP_RENDER_ONE_SORT
     | NSP_RENDER_DISPLAY_FLOAT
     | NSP_RENDER_PHOTOGRAPH
     | NSP_DEPTH_REVERSED
@@ -170,109 +111,6 @@ pub struct NspRender {
 unsafe impl Sized0 for NspRender {
     const NAME: &'static str = "NspRender";
     const FIRST_SIZE: usize = std::mem::offset_of!(Self, hdr10_nits);
-}
-
-/// The outcome of the newest frame that is done.
-#[repr(C)]
-#[derive(Clone, Copy, Debug)]
-pub struct NspStatus {
-    /// `sizeof(NspStatus)`.
-    pub struct_size: usize,
-    /// The number of the frame; 0: none is done yet.
-    pub frame: u64,
-    /// Intersections of splats and tiles, in the view that has the most.
-    pub intersections: u32,
-    /// The intersections that memory and budget allowed.
-    pub capacity: u32,
-    /// The intersections that were left out, the farthest.
-    pub left_out: u32,
-    /// The splats of the fullest tile if the device cannot process that many, and the tile is not drawn; else 0.
-    pub splats_per_tile: u32,
-    /// Bytes of device memory in use by all objects of the device.
-    pub device_bytes: u64,
-}
-
-// SAFETY: the size comes first; the rest are numbers.
-unsafe impl Sized0 for NspStatus {
-    const NAME: &'static str = "NspStatus";
-    const FIRST_SIZE: usize = size_of::<Self>();
-}
-
-/// What the newest pick that is done found.
-#[repr(C)]
-#[derive(Clone, Copy, Debug)]
-pub struct NspPick {
-    /// `sizeof(NspPick)`.
-    pub struct_size: usize,
-    /// The number of its frame; 0: none is done yet.
-    pub frame: u64,
-    /// 1: a splat blocks half of the light, with those before it; 0: none does, and the rest is 0.
-    pub is_hit: u32,
-    /// The index in `NspRender::instances`; 0 where a model is drawn.
-    pub instance: u32,
-    /// The index of the splat's Gaussian in its model.
-    pub gaussian: u32,
-    /// Its depth in the view, world units.
-    pub depth: f32,
-}
-
-// SAFETY: the size comes first; the rest are numbers.
-unsafe impl Sized0 for NspPick {
-    const NAME: &'static str = "NspPick";
-    const FIRST_SIZE: usize = size_of::<Self>();
-}
-
-/// Creates a renderer for models with the SH degree, near plane, colours and tone law of `model`.
-///
-/// # Safety
-/// `device` and `model` are NULL or valid; `renderer` is NULL or valid.
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn nsp_renderer_create(
-    device: *mut NspDevice,
-    model: *const NspModel,
-    renderer: *mut *mut NspRenderer,
-) -> NspResult {
-    guard("nsp_renderer_create", || {
-        // SAFETY: as the caller promises.
-        unsafe {
-            give(renderer, "renderer", || {
-                let gpu = object(device, "device")?.0.get("the device")?;
-                let LoadedModel { model, on_device } =
-                    object(model, "model")?.0.get("the model")?;
-                check_device(gpu, on_device)?;
-                let settings = RenderSettings { purpose: Purpose::Show, ..model.render_settings() };
-                let renderer = Renderer::new(gpu, settings)?;
-                Ok(NspRenderer(Object::new(Shown {
-                    gpu: gpu.clone(),
-                    renderer,
-                    sh_degree: model.gaussians.shape.sh_degree,
-                    gaussian_count: model.gaussians.count,
-                    appearance: appearance(model),
-                })))
-            })
-        }
-    })
-}
-
-/// Allocates memory for views of this size and for this many intersections, ahead of the first recording.
-///
-/// # Safety
-/// `renderer` is NULL or valid.
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn nsp_renderer_reserve(
-    renderer: *mut NspRenderer,
-    width: u32,
-    height: u32,
-    intersections: u32,
-) -> NspResult {
-    guard("nsp_renderer_reserve", || {
-        // SAFETY: as the caller promises.
-        let renderer = unsafe { object_mut(renderer, "renderer")? };
-        renderer.0.with("the renderer", |shown| {
-            shown.renderer.reserve_draw(shown.gaussian_count, [width, height], intersections)?;
-            Ok(())
-        })
-    })
 }
 
 /// Records the render of a model, or of `NspRender::instances` if `model` is NULL. Nothing is submitted, and nothing is
@@ -361,6 +199,7 @@ unsafe fn record(
         motion: motion.as_ref().map(|image| Motion { image, before: &before }),
         pick: has(NSP_RENDER_PICK).then_some(render.pick),
         budget: render.budget,
+        shares_sort: has(NSP_RENDER_ONE_SORT),
     };
     let sh_degree = match models {
         Models::One(_) => shown.sh_degree,
@@ -438,106 +277,4 @@ unsafe fn cameras(from: *const NspCamera, count: u32) -> Result<Vec<Camera>, Fai
         camera.camera().map_err(|problem| Failure::usage(format!("camera {at} {problem}")))
     };
     all.iter().enumerate().map(camera).collect()
-}
-
-fn lent(image: &NspImage, name: &str, cameras: u32) -> Result<HostImage, Failure> {
-    let layers = image.layers.max(1);
-    if u64::from(image.layer) + u64::from(cameras) > u64::from(layers) {
-        let layer = image.layer;
-        return Err(Failure::usage(format!(
-            "{name} has {layers} layers (NspImage::layers), and {cameras} cameras from layer {layer} on need more"
-        )));
-    }
-    if [image.before, image.after].iter().any(|state| state.is_owned > 1 || state.reserved != 0) {
-        return Err(Failure::usage(format!("{name} has a state whose is_owned is not 0 or 1")));
-    }
-    let format = ImageFormat::from_vulkan(image.format.as_raw()).ok_or_else(|| {
-        Failure::usage(format!(
-            "{name} has format {:?}; take RGBA16F, RGBA32F, B10G11R11, RGBA8 or BGRA8 (UNORM, SRGB), A2B10G10R10 or \
-             A2R10G10B10 for color, R32F or D32 for depth_out, RG16F or RG32F for motion_out, D32, D24, D16 or R32F \
-             for scene_depth",
-            image.format
-        ))
-    })?;
-    let state = |state: NspImageState| ImageState {
-        layout: state.layout.as_raw(),
-        family: if state.is_owned == 0 { vk::QUEUE_FAMILY_IGNORED } else { state.family },
-        stages: state.stages.as_raw(),
-        access: state.access.as_raw(),
-    };
-    Ok(HostImage {
-        handle: image.image.as_raw(),
-        format,
-        size: [image.extent.width, image.extent.height],
-        layer: image.layer,
-        before: state(image.before),
-        after: state(image.after),
-    })
-}
-
-/// Writes the outcome of the newest frame that is done to `status`. It never waits.
-///
-/// # Safety
-/// `renderer` and `status` are NULL or valid.
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn nsp_renderer_status(
-    renderer: *const NspRenderer,
-    status: *mut NspStatus,
-) -> NspResult {
-    guard("nsp_renderer_status", || {
-        // SAFETY: as the caller promises.
-        let Shown { gpu, renderer, .. } =
-            unsafe { object(renderer, "renderer")? }.0.get("the renderer")?;
-        let drawn = renderer.drawn();
-        let of = |member: fn(&Drawn) -> u32| drawn.as_ref().map_or(0, member);
-        let filled = NspStatus {
-            struct_size: size_of::<NspStatus>(),
-            frame: drawn.map_or(0, |drawn| drawn.frame),
-            intersections: of(|drawn| drawn.intersections),
-            capacity: of(|drawn| drawn.capacity),
-            left_out: of(|drawn| drawn.left_out()),
-            splats_per_tile: of(|drawn| drawn.splats_per_tile),
-            device_bytes: gpu.memory_in_use(),
-        };
-        // SAFETY: as the caller promises.
-        unsafe { write(status, &filled) }
-    })
-}
-
-/// Writes what the newest pick that is done found to `pick`. It never waits.
-///
-/// # Safety
-/// `renderer` and `pick` are NULL or valid.
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn nsp_renderer_picked(
-    renderer: *const NspRenderer,
-    pick: *mut NspPick,
-) -> NspResult {
-    guard("nsp_renderer_picked", || {
-        // SAFETY: as the caller promises.
-        let shown = unsafe { object(renderer, "renderer")? }.0.get("the renderer")?;
-        let Pick { frame, hit } = shown.renderer.picked().unwrap_or(Pick { frame: 0, hit: None });
-        let none = PickedSplat { instance: 0, gaussian: 0, depth: 0.0 };
-        let PickedSplat { instance, gaussian, depth } = hit.unwrap_or(none);
-        let filled = NspPick {
-            struct_size: size_of::<NspPick>(),
-            frame,
-            is_hit: hit.is_some().into(),
-            instance: instance as u32,
-            gaussian,
-            depth,
-        };
-        // SAFETY: as the caller promises.
-        unsafe { write(pick, &filled) }
-    })
-}
-
-/// Destroys a renderer; frames that use it may be in flight.
-///
-/// # Safety
-/// `renderer` is NULL or valid, and not used again.
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn nsp_renderer_destroy(renderer: *mut NspRenderer) {
-    // SAFETY: as the caller promises.
-    unsafe { destroy("nsp_renderer_destroy", renderer) }
 }

@@ -22,6 +22,9 @@
 //! With INSTANCES, the Gaussians are projected once for each of several instances of their model: a dispatch has the
 //! workgroups of the first instance, then those of the next, and each has whole workgroups of splats, the last of which
 //! may be culled for want of a Gaussian. The direction that SH are evaluated in is the model's.
+//!
+//! With SHARES_SORT, several views have one order, by the depth along an axis that they share, of all Gaussians, for
+//! another view may show what this one does not. The first view writes it, the others keep it.
 
 layout(local_size_x = 64) in;
 
@@ -34,6 +37,8 @@ layout(push_constant, scalar) uniform Params {
     uint  first_instance;  // with INSTANCES
     uint  instance_count;
     uint  first_splat;     // that is bound
+    uint  keeps_order;     // with SHARES_SORT, 1: keys and ids stay
+    vec4  sort_axis;       // with SHARES_SORT: depth of (point in the view, 1)
 };
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
@@ -42,6 +47,7 @@ layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in t
 layout(constant_id = 14) const bool ANTIALIASED = false;  // opacities are compensated for the dilation
 layout(constant_id = 16) const bool LAMP = false;  // colours are lit by a lamp at the camera
 layout(constant_id = 17) const bool INSTANCES = false;
+layout(constant_id = 18) const bool SHARES_SORT = false;
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // planes
 layout(binding = 1) writeonly buffer Splats     { ProjectedSplat splats[]; };
@@ -99,11 +105,15 @@ void main() {
     }
     uint slot = i, first = first_gaussian;  // of the splats
     if (INSTANCES) {
-        slot += instances[instance].first + first_gaussian;
+        slot += instances[instance].first + first_gaussian - first_splat;
         first = first_splat;
     }
-    ids[slot] = first + slot;
-    depth_keys[slot] = CULLED;
+    bool orders = true;
+    if (SHARES_SORT) orders = keeps_order == 0;
+    if (orders) {
+        ids[slot] = first + slot;
+        depth_keys[slot] = CULLED;
+    }
     tile_counts[slot] = 0;
     if (INSTANCES) {
         if (i >= gaussian_count) return;
@@ -114,6 +124,9 @@ void main() {
     if (INSTANCES) view = instances[instance].view_from_model;
     vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
     vec3 mean_in_view = view * vec4(mean, 1.0);
+    if (SHARES_SORT) {
+        if (orders) depth_keys[slot] = depth_key(dot(sort_axis, vec4(mean_in_view, 1.0)));
+    }
     float opacity = sigmoid(parameters[RAW_OPACITIES_COLUMN * gaussian_count + i]);
     if (INSTANCES) {
         opacity *= instances[instance].tint.a;
@@ -183,5 +196,6 @@ void main() {
         count += columns.y - columns.x;
     }
     tile_counts[slot] = count;
+    if (SHARES_SORT) return;
     if (count > 0) depth_keys[slot] = depth_key(depth);
 }

@@ -74,7 +74,7 @@ impl Renderer {
     ) -> Result<()> {
         let tile_count = view.tile_count();
         let Self { frame, sort, .. } = self;
-        if let Sort::Whole { by_depth, .. } = sort {
+        if let (Sort::Whole { by_depth, .. }, false) = (&mut *sort, view.order.is_kept()) {
             let all = Count { counts: &frame.gaussian_counts, index: 0 };
             by_depth.record(pass, all, &mut frame.depth_keys, &mut frame.ids, DEPTH_BITS)?;
         }

@@ -27,6 +27,7 @@ impl Renderer {
             camera_model,
             view_depths: true,
             instances: None,
+            shares_sort: false,
         })?;
         self.build_blending(true)?;
         let whole = Patch::from(camera);

@@ -3,8 +3,11 @@
 //! Where a view has more intersections than memory, the nearest are drawn and the memory grows before a later draw, as
 //! soon as the frame that overflowed is done.
 
+use std::slice;
+
 use nightsplat_core::camera::{Camera, Patch};
 
+use super::eyes::DepthOrder;
 use super::instances::{FirstSplat, Instance, VisibleInstances, layout_of, stored};
 use super::target::Target;
 use super::{DepthChannel, ProjectionKind, RenderOptions, Renderer};
@@ -84,6 +87,16 @@ pub(super) enum Drawing<'a> {
     Instances(&'a [Instance<'a>]),
 }
 
+/// A view of a draw.
+struct DrawnView<'a> {
+    camera: &'a Camera,
+    /// Among the cameras.
+    index: u32,
+    order: DepthOrder,
+    /// Those that have this order, itself among them.
+    sharing: &'a [Camera],
+}
+
 impl Renderer {
     /// Records the render of `gaussians` from each camera into the layers of the target's images. Takes each image
     /// from its state `before` and leaves it in its state `after`. Binds compute pipelines, descriptor set 0 and push
@@ -131,8 +144,14 @@ impl Renderer {
     ) -> Result<()> {
         Target::check_background(options.background)?;
         self.clear_status(pass);
-        for (layer, camera) in (0..).zip(cameras) {
-            self.draw_layer(pass, drawing, camera, layer, options, target)?;
+        let orders: Vec<_> = match target.has_one_sort(cameras) {
+            true => DepthOrder::shared(cameras).collect(),
+            false => vec![DepthOrder::Own; cameras.len()],
+        };
+        for (index, (camera, order)) in cameras.iter().zip(orders).enumerate() {
+            let sharing = if order.is_shared() { cameras } else { slice::from_ref(camera) };
+            let view = DrawnView { camera, index: index as u32, order, sharing };
+            self.draw_layer(pass, drawing, view, options, target)?;
         }
         let capacity = self.drawn_capacity(target);
         let Self { frame, host_targets, .. } = self;
@@ -178,7 +197,8 @@ impl Renderer {
         for camera in cameras {
             let camera_model = model_number(&camera.model);
             let view_depths = target.needs_depths();
-            let kind = ProjectionKind { camera_model, view_depths, instances: None };
+            let shares_sort = target.has_one_sort(cameras);
+            let kind = ProjectionKind { camera_model, view_depths, instances: None, shares_sort };
             self.build_projections(kind)?;
         }
         self.build_blending(target.needs_depths())?;
@@ -229,7 +249,9 @@ impl Renderer {
             let camera_model = model_number(&camera.model);
             for instance in instances {
                 let instances = Some(stored(&instance.gaussians.layout));
-                self.build_projections(ProjectionKind { camera_model, view_depths, instances })?;
+                let shares_sort = target.has_one_sort(cameras);
+                let kind = ProjectionKind { camera_model, view_depths, instances, shares_sort };
+                self.build_projections(kind)?;
             }
         }
         Ok(())
@@ -279,8 +301,7 @@ impl Renderer {
         &mut self,
         pass: &mut Recorder<'_>,
         drawing: Drawing<'_>,
-        camera: &Camera,
-        layer: u32,
+        DrawnView { camera, index: layer, order, sharing }: DrawnView<'_>,
         options: &RenderOptions,
         target: &Target<'_>,
     ) -> Result<()> {
@@ -302,28 +323,23 @@ impl Renderer {
         let capacity = self.drawn_capacity(target);
         // The background is mixed in as the image counts colours.
         let before_black = RenderOptions { background: [0.0; 3], ..*options };
-        let firsts = match drawing {
+        let view = self.view(&camera.into(), depths.is_some(), order)?;
+        pass.update(&mut self.frame.camera, &[(&Patch::from(camera)).into()])?;
+        let (count, firsts) = match drawing {
             Drawing::Model(gaussians) => {
-                self.record_forward(
-                    pass,
-                    gaussians,
-                    camera,
-                    &before_black,
-                    depths,
-                    Some(capacity),
-                )?;
-                vec![FirstSplat { splat: self.context_count() as u32, instance: 0 }]
+                self.check(&gaussians.layout)?;
+                self.record_project(pass, gaussians, &view, options.sh_degree)?;
+                let first = self.context_count();
+                let firsts = vec![FirstSplat { splat: first as u32, instance: 0 }];
+                (first + gaussians.layout.count, firsts)
             }
             Drawing::Instances(instances) => {
-                let visible = VisibleInstances::new(instances, camera, &self.settings);
-                let view = self.view(&camera.into(), depths.is_some())?;
-                pass.update(&mut self.frame.camera, &[(&Patch::from(camera)).into()])?;
+                let visible = VisibleInstances::new(instances, camera, sharing, &self.settings);
                 self.record_instances(pass, &visible, &view, options.sh_degree)?;
-                let count = visible.count as u32;
-                self.record_splats(pass, count, &view, &before_black, depths, Some(capacity))?;
-                visible.firsts
+                (visible.count, visible.firsts)
             }
         };
+        self.record_splats(pass, count as u32, &view, &before_black, depths, Some(capacity))?;
         if let Some(motion) = &target.motion {
             let image = HostImage { layer: motion.image.layer + layer, ..*motion.image };
             let cameras = [camera, &motion.before[layer as usize]];

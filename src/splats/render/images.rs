@@ -113,7 +113,7 @@ impl Renderer {
         depths: Option<DepthChannel>,
     ) -> Result<Status> {
         let status = self.gpu.clone().run("render", |pass| {
-            self.record_forward(pass, gaussians, *patch, options, depths, None)?;
+            self.record_forward(pass, gaussians, *patch, options, depths)?;
             let status = pass.download(&self.frame.status)?;
             self.clear_status(pass);
             Ok(status)

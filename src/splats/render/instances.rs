@@ -177,7 +177,7 @@ pub(super) fn stored(layout: &Layout) -> (u32, StorageFormat) {
     (layout.shape.sh_degree, layout.sh_rest)
 }
 
-/// The splats of an instance: those of its Gaussians, and of whole workgroups, so that each model's can be bound.
+/// The splats of an instance: those of its Gaussians, up to whole workgroups, as a dispatch has.
 fn splats_of(layout: &Layout) -> usize {
     layout.count.next_multiple_of(GROUP as usize)
 }
@@ -186,8 +186,6 @@ fn splats_of(layout: &Layout) -> usize {
 struct InstancedModel<'a> {
     gaussians: GaussianSlice<'a>,
     instances: Range<u32>,
-    /// Of all its instances.
-    splats: Range<usize>,
 }
 
 /// The first splat of an instance, and its place in the draw.
@@ -197,7 +195,7 @@ pub(super) struct FirstSplat {
     pub(super) instance: usize,
 }
 
-/// The instances that a camera may see.
+/// The instances that cameras may see.
 pub(super) struct VisibleInstances<'a> {
     models: Vec<InstancedModel<'a>>,
     table: Vec<InstanceView>,
@@ -208,10 +206,17 @@ pub(super) struct VisibleInstances<'a> {
 }
 
 impl<'a> VisibleInstances<'a> {
-    pub(super) fn new(all: &[Instance<'a>], camera: &Camera, settings: &RenderSettings) -> Self {
+    /// As one of the cameras sees them, those that any of them may see: views that share an order have the same splats.
+    pub(super) fn new(
+        all: &[Instance<'a>],
+        camera: &Camera,
+        seen_by: &[Camera],
+        settings: &RenderSettings,
+    ) -> Self {
         let mut by_model: Vec<(GaussianSlice<'a>, Vec<(usize, &Instance<'a>)>)> = vec![];
         let is_drawn = |(_, instance): &(usize, &Instance<'a>)| {
-            instance.is_visible && instance.may_be_seen(camera, settings)
+            instance.is_visible
+                && seen_by.iter().any(|camera| instance.may_be_seen(camera, settings))
         };
         let mut models = HashMap::new();
         for (at, instance) in all.iter().enumerate().filter(is_drawn) {
@@ -226,14 +231,13 @@ impl<'a> VisibleInstances<'a> {
         for (gaussians, instances) in by_model {
             let first = table.len() as u32;
             let each = splats_of(&gaussians.layout);
-            for (&(at, instance), first) in instances.iter().zip((0..).step_by(each.max(1))) {
-                table.push(instance.view(camera, first));
-                firsts.push(FirstSplat { splat: count as u32 + first, instance: at });
+            for (&(at, instance), first) in instances.iter().zip((count..).step_by(each.max(1))) {
+                table.push(instance.view(camera, first as u32));
+                firsts.push(FirstSplat { splat: first as u32, instance: at });
             }
-            let splats = count..count + each * instances.len();
-            count = splats.end;
+            count += each * instances.len();
             let instances = first..table.len() as u32;
-            models.push(InstancedModel { gaussians, instances, splats });
+            models.push(InstancedModel { gaussians, instances });
         }
         Self { models, table, firsts, count }
     }
@@ -270,11 +274,12 @@ impl Renderer {
         let are_disjoint = visible.models.iter().all(|model| passes(model) == 1);
         let mut record = |pass: &mut Recorder<'_>| {
             visible.models.iter().try_for_each(|model| {
-                let InstancedModel { gaussians, ref instances, ref splats } = *model;
+                let InstancedModel { gaussians, ref instances } = *model;
                 let kind =
                     ProjectionKind { instances: Some(stored(&gaussians.layout)), ..view.kind };
                 let sh_degree = sh_degree.min(gaussians.layout.shape.sh_degree);
-                let (splats, instances) = (splats.clone(), instances.clone());
+                // Those of all models are bound, as later passes do: the next pass then binds its Gaussians alone.
+                let (splats, instances) = (0..visible.count, instances.clone());
                 projecting.record(
                     pass,
                     view,

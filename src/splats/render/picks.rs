@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 
 use nightsplat_core::camera::{Camera, Patch};
 
+use super::Renderer;
 use super::instances::FirstSplat;
-use super::{KernelView, Renderer};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Ring, Threads};
 use crate::kernels::pick_splats::{self, NO_SPLAT};
@@ -92,7 +92,8 @@ impl Renderer {
         pixel: Option<u32>,
         has_limits: bool,
     ) -> Result<()> {
-        let KernelView { size, tiles, .. } = self.view(&camera.into(), true)?;
+        let size = Patch::from(camera).size;
+        let tile_columns = self.tiles(size).x;
         let Self { frame, limits, picks, .. } = self;
         let Some(picks) = picks else { return Ok(()) };
         let pixel_count = pixel.map_or(Patch::from(camera).pixel_count() as u32, |_| 1);
@@ -101,7 +102,7 @@ impl Renderer {
             &picks.kernel,
             &pick_splats::Params {
                 size,
-                tile_columns: tiles.x,
+                tile_columns,
                 first_pixel: pixel.unwrap_or_default(),
                 pixel_count,
                 has_limits: has_limits.into(),

@@ -64,6 +64,7 @@ impl Renderer {
             camera_model: model_number(&CameraModel::Pinhole),
             view_depths: false,
             instances: None,
+            shares_sort: false,
         };
         let frozen_columns = gradients.frozen_columns;
         let lamp = settings.lamp;
@@ -189,6 +190,8 @@ pub(super) struct ProjectionKind {
     /// The stored SH degree of instances and its format; one dispatch has several of them. `None`: a model without
     /// transform, as the renderer's settings say.
     pub(super) instances: Option<(u32, StorageFormat)>,
+    /// Whether the order of depth is that of several views.
+    pub(super) shares_sort: bool,
 }
 
 /// The gradients that the backward pass writes.
@@ -212,7 +215,7 @@ impl Projections {
         gpu: &Gpu,
         settings: &RenderSettings,
         [tile_width, tile_height]: [u32; 2],
-        ProjectionKind { camera_model, view_depths: has_depths, instances }: ProjectionKind,
+        ProjectionKind { camera_model, view_depths: has_depths, instances, shares_sort }: ProjectionKind,
         WrittenGradients { kind, frozen_columns }: WrittenGradients,
     ) -> Result<Self> {
         let color_gradients = kind == GradientKind::Colors;
@@ -241,7 +244,8 @@ impl Projections {
                 })?
             };
         }
-        let is_trained_on = camera_model != CAMERA_ORTHOGRAPHIC && !has_depths && !is_instanced;
+        let is_shown = has_depths || is_instanced || shares_sort;
+        let is_trained_on = camera_model != CAMERA_ORTHOGRAPHIC && !is_shown;
         let has_gradients = settings.purpose == Purpose::Train && is_trained_on;
         let backward = if has_gradients {
             Some(pipeline!(project_backward, color_gradients, frozen_columns))
@@ -249,7 +253,7 @@ impl Projections {
             None
         };
         let instances = is_instanced;
-        Ok(Self { forward: pipeline!(project, view_depths, instances), backward })
+        Ok(Self { forward: pipeline!(project, view_depths, instances, shares_sort), backward })
     }
 }
 

@@ -21,7 +21,7 @@ pub(super) struct Projected<'a> {
     pub(super) gaussians: GaussianSlice<'a>,
     pub(super) kind: ProjectionKind,
     pub(super) sh_degree: u32,
-    /// Of all of them, and of all their instances.
+    /// Those that are bound: theirs, or those of all instances.
     pub(super) splats: Range<usize>,
     /// In the table of the view; none where they are drawn as they are.
     pub(super) instances: Range<u32>,
@@ -125,6 +125,8 @@ impl Projecting<'_> {
                 first_instance: instances.start,
                 instance_count,
                 first_splat: splats.start as u32,
+                keeps_order: view.order.is_kept().into(),
+                sort_axis: view.order.axis(),
             },
             project::Buffers {
                 parameters: batch.rows(parameters, layout.words())?,

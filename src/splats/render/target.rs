@@ -6,6 +6,7 @@ use glam::Vec3;
 use nightsplat_core::camera::{Camera, CameraModel, Patch, deviation_from_rigid};
 use nightsplat_core::curves::SceneLaw;
 
+use super::eyes::check_axes;
 use crate::gpu::{HostImage, ImageFormat};
 use crate::kernels::pixels::{
     DEPTH_16, DEPTH_24, DEPTH_FLOAT, LIGHT_DISPLAY, LIGHT_HDR10, LIGHT_LINEAR, LIGHT_SRGB,
@@ -52,6 +53,11 @@ pub struct Target<'a> {
     pub pick: Option<[u32; 2]>,
     /// The most intersections of splats and tiles, of which the farthest are left out first; 0: as memory allows.
     pub budget: u32,
+    /// All cameras have one sort, by the depth along the mean of their axes: pinholes or orthographic, which look at
+    /// most 30 degrees beside it. Where their axes are parallel, as those of most headsets are, the pictures are the
+    /// same; else two splats may change their order in a pixel that both cover, where their depths differ by less than
+    /// the tangent of the angle between axis and mean, times the distance of their centres across it.
+    pub shares_sort: bool,
 }
 
 impl Default for Target<'_> {
@@ -70,6 +76,7 @@ impl Default for Target<'_> {
             motion: None,
             pick: None,
             budget: 0,
+            shares_sort: false,
         }
     }
 }
@@ -162,6 +169,11 @@ impl Target<'_> {
         is_used || self.depth.is_some() || self.scene.is_some()
     }
 
+    /// Whether these cameras share a sort.
+    pub(super) fn has_one_sort(&self, cameras: &[Camera]) -> bool {
+        self.shares_sort && cameras.len() > 1
+    }
+
     /// Refuses a background that is not finite.
     pub(super) fn check_background(background: [f32; 3]) -> Result<()> {
         match background.iter().all(|channel| channel.is_finite()) {
@@ -192,6 +204,9 @@ impl Target<'_> {
                 "the model states no tone law, and its photographs are unknown; train one with a named tone curve"
                     .to_owned(),
             );
+        }
+        if self.has_one_sort(cameras) {
+            check_axes(cameras)?;
         }
         check_image("color", self.color, COLOR_FORMATS, cameras)?;
         self.check_hdr10()?;

@@ -3,6 +3,7 @@
 #![expect(unsafe_code, reason = "calls what C calls")]
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
+mod eyes;
 #[path = "../../../../tests/gpu/host.rs"]
 #[allow(dead_code, reason = "tests of the Rust host use more")]
 mod host;
@@ -30,10 +31,7 @@ use nightsplat_capi::camera::{NspCamera, nsp_camera_from_matrices};
 use nightsplat_capi::device::*;
 use nightsplat_capi::error::panics::panic_in;
 use nightsplat_capi::error::*;
-use nightsplat_capi::instance::*;
-use nightsplat_capi::model::*;
-use nightsplat_capi::render::*;
-use nightsplat_capi::train::*;
+use nightsplat_capi::{image::*, instance::*, model::*, render::*, renderer::*, train::*};
 use nightsplat_core::camera::CameraModel;
 use nightsplat_core::random::Stream;
 use nightsplat_photographs::image::linear_from_srgb;

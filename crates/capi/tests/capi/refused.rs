@@ -119,6 +119,15 @@ fn every_bad_render_is_refused_by_code_and_name_and_nothing_is_recorded() {
         NSP_ERROR_USAGE,
         &["states no tone law", "named tone curve"],
     );
+    let mut eyes = [camera; 2];
+    // Turned by half a circle about y.
+    (eyes[1].view_from_world[0], eyes[1].view_from_world[10]) = (-1.0, -1.0);
+    let layered = NspImage { layers: 2, ..color };
+    let one_sort = |changed: &mut NspRender| {
+        (changed.cameras, changed.camera_count) = (eyes.as_ptr(), 2);
+        (changed.color, changed.flags) = (&layered, NSP_RENDER_ONE_SORT);
+    };
+    refuse(&one_sort, NSP_ERROR_USAGE, &["beside the mean", "one sort"]);
     refuse(&|changed| changed.color = null(), NSP_ERROR_USAGE, &["no target"]);
     refuse(&|changed| changed.exposure = f32::INFINITY, NSP_ERROR_USAGE, &["exposure"]);
     let with = |change: &dyn Fn(&mut NspImage), code, words: &[&str]| {
