@@ -397,6 +397,9 @@ fn demo_is_a_sweep_of_four_curves_that_continues_and_links_the_model() {
     let page = fs::read_to_string(folder.path().join("index.html")).unwrap();
     assert!(page.contains("exposed") && page.contains("data:image/png"));
     assert!(page.contains("<a href=\"curve=auto/model.html\">"));
+    // First the flight, then pictures, then scores.
+    let order = ["<iframe", "data:image/png", "<table"].map(|part| page.find(part).unwrap());
+    assert!(order.is_sorted(), "{order:?}");
     assert!(folder.path().join("curve=auto/model.html").is_file());
     assert_eq!(succeed(&demo), table, "nothing is trained twice");
 }
