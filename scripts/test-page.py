@@ -79,9 +79,11 @@ GREY = """(async () => {
 
 # What the button of the live page downloads.
 SAVED = """(async () => {
+  const own = window.download;
   const saved = new Promise((done) => { window.download = (name, blob) => done({ name, blob }); });
   document.getElementById('exportModel').click();
   const { name, blob } = await saved;
+  window.download = own;
   return { name, bytes: (await asUri(blob)).replace(/^.*,/, '') };
 })()"""
 

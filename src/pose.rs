@@ -30,7 +30,7 @@ use nightsplat_photographs::tree::check_writable;
 pub use self::cameras::describe;
 use self::pictures::{BRIGHT, PosePhotographs, bright_name, is_dark};
 use self::reconstruction::Reconstruction;
-pub use self::reconstruction::{Features, Mapper, Matcher};
+pub use self::reconstruction::{Mapper, Matcher, PoseFeatures};
 use self::tool::Tool;
 pub use self::tool::how_to_install;
 use self::unfinished::Unfinished;
@@ -59,7 +59,7 @@ pub struct PoseOptions {
     /// By default sequential for a clip, else exhaustive.
     pub matcher: Option<Matcher>,
     /// By default SIFT, then learned ones where few photographs have a camera and this COLMAP has them.
-    pub features: Option<Features>,
+    pub features: Option<PoseFeatures>,
     /// The mapper that registers cameras.
     pub mapper: Mapper,
     /// COLMAP options, each `NAME=VALUE`.
@@ -208,7 +208,7 @@ fn posed(
     if let Some(remark) = motion::at_rest(&dark_copies) {
         tracing::warn!("{remark}");
     }
-    if options.features != Some(Features::Learned) {
+    if options.features != Some(PoseFeatures::Learned) {
         let [features, matches, cameras] = expected::seconds(&pictures, matcher);
         report(PoseProgress::Line(&format!(
             "{} in all, coarsely: features {}, matching {}, cameras {}",

@@ -13,7 +13,7 @@ use crate::gpu::DeviceChoice;
 
 /// Write a small dark dataset, train on it with several tone curves, and compare the results on a page.
 ///
-/// Takes less than three minutes on two processor cores. DIR/index.html is a self-contained page; the dataset is in
+/// Takes about four minutes on two processor cores. DIR/index.html is a self-contained page; the dataset is in
 /// DIR/dataset, with a run directory per curve next to it. An interrupted demo continues.
 #[derive(Clone, Debug, clap::Args)]
 pub struct DemoArgs {
@@ -68,7 +68,7 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     let title = "3D Gaussian Splatting from dark photographs";
     sweep::run_titled(&sweep, title, &[intro], Some(window))?;
     let shown = args.out.join(SHOWN);
-    let export = command("export", &[&shown], &["--format", "html"]);
+    let export = command("export", &[&shown], &["--format", "html", "--title", "A dark room"]);
     export::write(&parsed::<ExportArgs>("demo", export)?)?;
     Ok(())
 }

@@ -50,9 +50,9 @@ pub struct EditArgs {
 }
 
 const EXAMPLES: &str = "Examples:
-  nightsplat edit run --floaters --out clean.ply                  without what the photographs contradict
-  nightsplat edit run --crop cameras --out near.ply               without what lies outside and no photograph shows
-  nightsplat edit a.ply --crop 0,0,0,1.5 --out b.ply              within 1.5 of the origin
+  nightsplat edit run --floaters --out clean.ply      without floaters
+  nightsplat edit run --crop cameras --out near.ply   what is near or photographed
+  nightsplat edit a.ply --crop 0,0,0,1.5 --out b.ply  within 1.5 of the origin
   nightsplat edit run --up auto --scale 0,0,0:1,0,0=0.82 --out metres.ply
   nightsplat edit run --max-gaussians 20000 --sh-degree 1 --out small.spz
   nightsplat edit a.ply --rotate y:90 --move 2,0,0 --merge b.ply --out both.ply";

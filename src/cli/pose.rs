@@ -12,7 +12,7 @@ use super::{finish, progress_bar, signals, tell_on_stderr, word};
 use crate::driver;
 use crate::gpu::DeviceChoice;
 use crate::pose::{
-    Features, Mapper, Matcher, PoseOptions, PoseProgress, PoseWatch, Posed, describe, estimate,
+    Mapper, Matcher, PoseFeatures, PoseOptions, PoseProgress, PoseWatch, Posed, describe, estimate,
 };
 use crate::results::run::Requests;
 
@@ -62,7 +62,7 @@ pub(super) struct PoseChoices {
     /// The features that are matched [default: SIFT, then learned ones where most photographs have no camera and this
     /// COLMAP has them]
     #[arg(long, value_enum)]
-    features: Option<Features>,
+    features: Option<PoseFeatures>,
     /// Register cameras one by one, or all at once, which is faster for many photographs
     #[arg(long, value_enum, default_value_t = Mapper::Incremental)]
     mapper: Mapper,

@@ -34,7 +34,7 @@ impl Matcher {
 
 /// The features that are found in photographs, and matched.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum Features {
+pub enum PoseFeatures {
     /// SIFT, matched by distance
     Sift,
     /// ALIKED, matched by LightGlue: networks that COLMAP fetches once (COLMAP from 4.0 on, built with ONNX)
@@ -59,7 +59,7 @@ pub(super) struct Reconstruction<'a> {
     /// How many, dark and bright.
     photographs: usize,
     matcher: Matcher,
-    features: Features,
+    features: PoseFeatures,
     /// Whether this COLMAP has learned features.
     can_learn: bool,
     /// Whether matching uses the two-view geometry that it found before.
@@ -83,7 +83,7 @@ struct Attempt {
 }
 
 impl Attempt {
-    fn of(models: &Path) -> Result<Self> {
+    fn read(models: &Path) -> Result<Self> {
         let largest = Dataset::largest_model(models, is_dark)?;
         let placed =
             largest.map_or(0, |(_, placed)| placed.iter().filter(|name| is_dark(name)).count());
@@ -92,7 +92,7 @@ impl Attempt {
 
     /// Takes another that has more.
     fn improve(&mut self, models: &Path) -> Result<()> {
-        let found = Self::of(models)?;
+        let found = Self::read(models)?;
         if found.placed > self.placed {
             *self = found;
         }
@@ -135,7 +135,7 @@ impl<'a> Reconstruction<'a> {
         let glomap = || colmap.beside(&settings.glomap, "glomap").found();
         let glomap = needs_glomap.then(glomap).transpose()?;
         let can_learn = colmap.has_option("feature_extractor", LEARNED_OPTION);
-        if settings.features == Some(Features::Learned) && !can_learn {
+        if settings.features == Some(PoseFeatures::Learned) && !can_learn {
             let problem = "--features learned: this COLMAP has no ALIKED features; name COLMAP 4.0 or later with \
                            --colmap PATH, or take --features sift";
             return Err(Error::Usage(problem.to_owned()));
@@ -167,7 +167,7 @@ impl<'a> Reconstruction<'a> {
             options: settings,
             photographs: 0,
             matcher,
-            features: settings.features.unwrap_or(Features::Sift),
+            features: settings.features.unwrap_or(PoseFeatures::Sift),
             can_learn,
             is_guided: false,
             relaxed: &[],
@@ -182,7 +182,7 @@ impl<'a> Reconstruction<'a> {
     /// The features of the attempts, in a line.
     pub(super) fn plan(&self) -> Option<&'static str> {
         match (self.features, self.tries_learned()) {
-            (Features::Learned, _) => Some("learned features: ALIKED, matched by LightGlue"),
+            (PoseFeatures::Learned, _) => Some("learned features: ALIKED, matched by LightGlue"),
             (_, true) => {
                 Some("SIFT features; if most photographs have no camera, learned ones too")
             }
@@ -210,7 +210,7 @@ impl<'a> Reconstruction<'a> {
         self.photographs = pictures.dark.len() + pictures.bright.len();
         self.attempt(pictures, report)?;
         let all = pictures.dark.len();
-        let mut best = Attempt::of(&self.models)?;
+        let mut best = Attempt::read(&self.models)?;
         if 10 * best.placed >= 9 * all || self.options.patience == 0.0 {
             return Ok(best.models);
         }
@@ -224,14 +224,14 @@ impl<'a> Reconstruction<'a> {
         };
         if 2 * best.placed < all && self.tries_learned() {
             again(best.placed, &format!("learned features, for at most {most}"));
-            self.features = Features::Learned;
+            self.features = PoseFeatures::Learned;
             match self.attempt(pictures, report) {
                 Err(error) if error.is_stop() => return Err(error),
                 Err(error) => tracing::warn!("{error}; going on with SIFT"),
                 Ok(()) => best.improve(&self.models)?,
             }
             if best.models != self.models {
-                self.features = Features::Sift;
+                self.features = PoseFeatures::Sift;
             }
         }
         if 10 * best.placed < 9 * all && !self.is_late() {
@@ -273,7 +273,7 @@ impl<'a> Reconstruction<'a> {
         Ok(best.models)
     }
 
-    /// Features, matches and cameras.
+    /// PoseFeatures, matches and cameras.
     fn attempt(
         &mut self,
         pictures: &PosePhotographs,
@@ -303,8 +303,8 @@ impl<'a> Reconstruction<'a> {
     /// The name of a stage with these features.
     fn stage(&self, name: &str) -> String {
         match self.features {
-            Features::Sift => name.to_owned(),
-            Features::Learned => format!("learned-{name}"),
+            PoseFeatures::Sift => name.to_owned(),
+            PoseFeatures::Learned => format!("learned-{name}"),
         }
     }
 
@@ -314,14 +314,14 @@ impl<'a> Reconstruction<'a> {
 
     /// An error, with the remedy where it is that COLMAP has no networks.
     fn without_networks(&self, error: Error) -> Error {
-        if error.is_stop() || self.features == Features::Sift {
+        if error.is_stop() || self.features == PoseFeatures::Sift {
             return error;
         }
         let problem = if self.colmap.printed(NO_NETWORKS) {
             "this COLMAP is built without ONNX, which learned features need; take one that has it \
              (-DONNX_ENABLED=ON), or --features sift"
         } else if NOT_FETCHED.iter().any(|words| self.colmap.printed(words)) {
-            "COLMAP could not fetch the networks of ALIKED and LightGlue; connect for the first call, or name files with \
+            "COLMAP could not fetch the networks of ALIKED and LightGlue; connect for the first call, or name files by \
              --colmap-option AlikedExtraction.n16rot_model_path=FILE and AlikedMatching.lightglue_model_path=FILE"
         } else {
             return error;
@@ -374,7 +374,7 @@ impl<'a> Reconstruction<'a> {
                 ("ImageReader.camera_model".to_owned(), self.options.camera_model.as_str().into()),
                 (use_gpu.clone(), self.gpu().into()),
             ]);
-            if self.features == Features::Learned {
+            if self.features == PoseFeatures::Learned {
                 options.push(("FeatureExtraction.type".to_owned(), "ALIKED_N16ROT".into()));
             }
             if pictures.masks.is_dir() {
@@ -407,7 +407,7 @@ impl<'a> Reconstruction<'a> {
         let of_matching = |option| self.named(command, ["FeatureMatching", "SiftMatching"], option);
         let mut options = vec![("database_path".to_owned(), self.database.clone().into())];
         options.push((of_matching("use_gpu"), self.gpu().into()));
-        if self.features == Features::Learned {
+        if self.features == PoseFeatures::Learned {
             options.push(("FeatureMatching.type".to_owned(), "ALIKED_LIGHTGLUE".into()));
         }
         // With the relative pose of two photographs, more of their features are matched.

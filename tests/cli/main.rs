@@ -136,7 +136,9 @@ fn eval_agrees_with_train_and_saves_the_scored_images() {
     says(&fixture.text("eval.html"), &parts);
     let table = fixture.succeed("eval @run");
     let lines: Vec<&str> = table.lines().collect();
-    assert!(lines.len() == 5 && lines[4].starts_with("next: nightsplat "), "{table}");
+    let verdict = ": 2 test views match the reference images in normal light, with PSNR ";
+    assert!(lines[4].contains(verdict), "{table}");
+    assert!(lines.last().unwrap().starts_with("next: nightsplat "), "{table}");
     assert!(lines[0].starts_with("view") && lines[0].contains("channel mean"), "{table}");
     let mean = format!("{:.2}", trained["mean"]["psnr"].as_f64().unwrap());
     assert!(lines[3].starts_with("mean") && lines[3].contains(&mean), "{table}");
@@ -314,8 +316,11 @@ fn demo_is_a_sweep_of_four_curves_that_continues_and_links_the_model() {
     for curve in ["auto", "linear", "ase", "ap3"] {
         assert!(folder.path(&format!("curve={curve}/model.ply")).is_file(), "{table}");
     }
-    let link = "<a href=\"curve=auto/model.html\">";
-    says(&folder.text("index.html"), &["exposed", "data:image/png", link]);
+    let page = folder.text("index.html");
+    says(&page, &["exposed", "<a href=\"curve=auto/model.html\">"]);
+    // First the flight, then pictures, then scores.
+    let order = ["<iframe", "data:image/png", "<table"].map(|part| page.find(part).unwrap());
+    assert!(order.is_sorted(), "{order:?}");
     assert!(folder.path("curve=auto/model.html").is_file());
     assert_eq!(folder.succeed("demo --out @ --steps 20"), table, "nothing is trained twice");
 }
