@@ -24,7 +24,8 @@ pub(crate) fn compile(out_dir: &Path) {
         let compiled = compiler::compile(&path, &restricted(&source));
         let kernel = Kernel::reflect(&path, &source, &compiled.reflected, &mut structs);
         assert!(names.insert(kernel.name.clone()), "two kernels are called {}", kernel.name);
-        let bytes: Vec<u8> = compiled.shipped.iter().flat_map(|word| word.to_le_bytes()).collect();
+        let shipped = without_names(&compiled.shipped);
+        let bytes: Vec<u8> = shipped.iter().flat_map(|word| word.to_le_bytes()).collect();
         fs::write(out_dir.join(&kernel.name).with_extension("spv"), bytes)
             .expect("OUT_DIR is ours");
         let says = Text::read_with_includes(&source);
@@ -42,6 +43,22 @@ pub const ALL: &[(&gpu::Interface, Defaults)] = &[\n{all}];\n"
     );
     let kernels = structs.write(&text) + &glsl::include_modules() + &names + &all + &kernels;
     fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");
+}
+
+/// The module without the names of its variables and types, a sixth of it, which no driver reads.
+fn without_names(module: &[u32]) -> Vec<u32> {
+    /// From `OpSourceContinued` to `OpLine` in the specification: what is there for debuggers.
+    const DEBUG: std::ops::RangeInclusive<u32> = 2..=8;
+    let (header, mut rest) = module.split_at(5);
+    let mut kept = header.to_vec();
+    while let [first, ..] = rest {
+        let (instruction, after) = rest.split_at((first >> 16) as usize);
+        if !DEBUG.contains(&(first & 0xffff)) {
+            kept.extend(instruction);
+        }
+        rest = after;
+    }
+    kept
 }
 
 /// The source with `restrict` on every buffer, so that drivers may move loads across stores. It holds: a pass binds

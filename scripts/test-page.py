@@ -77,6 +77,14 @@ GREY = """(async () => {
   };
 })()"""
 
+# What the button of the live page downloads.
+SAVED = """(async () => {
+  const saved = new Promise((done) => { window.download = (name, blob) => done({ name, blob }); });
+  document.getElementById('exportModel').click();
+  const { name, blob } = await saved;
+  return { name, bytes: (await asUri(blob)).replace(/^.*,/, '') };
+})()"""
+
 
 class Browser:
     """Chromium with one page."""
@@ -403,6 +411,9 @@ def live(browser, nightsplat, dataset, run):
                 time.sleep(0.02)
             seconds = browser.wait(f"Number(document.documentElement.dataset.version) > {shown}")
         browser.open(serving.url)
+        saved = browser.evaluate(SAVED)
+        is_right = saved["name"] == "model.ply" and base64.b64decode(saved["bytes"]) == (run / "model.ply").read_bytes()
+        failed += report(is_right, f"the model of a training is downloaded: {len(saved['bytes']) * 3 // 4096} KiB")
         exported = browser.evaluate(EXPORTED)
         (run / "exported.html").write_text(exported)
         browser.evaluate("document.getElementById('stop').click()")
@@ -432,6 +443,45 @@ def press(browser, x, y, to=None):
     for kind, (left, top) in (("mousePressed", (x, y)), ("mouseMoved", to or (x, y)), ("mouseReleased", to or (x, y))):
         buttons = 0 if kind == "mouseReleased" else 1
         browser.call("Input.dispatchMouseEvent", type=kind, x=left, y=top, button="left", buttons=buttons, clickCount=1)
+
+
+def press_key(browser, key, text=""):
+    """Types a key as a keyboard does, which also moves the focus and clicks."""
+    codes = {"Tab": 9, "Enter": 13, "Escape": 27, "ArrowRight": 39}
+    for kind in ("keyDown", "keyUp"):
+        typed = {"text": text} if text and kind == "keyDown" else {}
+        browser.call(
+            "Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=codes[key], **typed
+        )
+
+
+def keyboard_alone(browser, page):
+    """Every control of the bar is reached and used without a mouse, with a ring around it; a link carries the look."""
+    browser.open(page.as_uri())
+    browser.resize(800, 600)
+    found, rings = [], []
+    for _ in range(8):
+        found.append(browser.evaluate("document.activeElement.id"))
+        rings.append(browser.evaluate("getComputedStyle(document.activeElement).outlineStyle"))
+        press_key(browser, "Tab" if len(found) < 8 else "Enter", "" if len(found) < 8 else "\r")
+    opened = browser.evaluate("element('info').open")
+    press_key(browser, "Escape")
+    back = browser.evaluate("!element('info').open && document.activeElement.id === 'about'")
+    bar = ["canvas", "divider", "play", "before", "brightness", "warmth", "fullscreen", "about"]
+    # The divider has its ring around the handle.
+    is_right = found == bar and set(rings[2:]) == {"solid"} and opened and back
+    failed = report(is_right, f"with a keyboard alone: {found}; rings {rings}")
+
+    browser.evaluate("element('brightness').focus()")
+    press_key(browser, "ArrowRight")
+    browser.settle()
+    link, mean = browser.evaluate("location.href"), browser.evaluate(MEAN)
+    browser.open(link.partition("#")[0], face=link.partition("#")[2])
+    browser.resize(800, 600)
+    browser.settle()
+    value, again = browser.evaluate("element('brightness').value"), browser.evaluate(MEAN)
+    is_right = "brightness=0.05" in link and value == "0.05" and mean == again
+    return failed + report(is_right, f"a link carries the look: {link.partition('#')[2]}")
 
 
 def share(browser, page):
@@ -610,6 +660,7 @@ def main():
             failed += lamp(browser, run, folder, SIZES[0])
             failed += not edits(browser, run, page, folder, SIZES[0])
             failed += share(browser, page)
+            failed += keyboard_alone(browser, page)
             failed += phone(browser, page)
             failed += tags(browser, run, folder)
             failed += cameras_of_a_dataset(browser, nightsplat, trained)

@@ -375,10 +375,9 @@ impl Drop for GpuShared {
         if let Some(owned) = &self.owned {
             owned.save_pipeline_cache(&self.device, self.pipeline_cache);
         }
-        let pipelines = std::mem::take(&mut *lock(&self.pipelines));
         // SAFETY: every object below was created here and nothing uses it any more.
         unsafe {
-            pipelines.values().for_each(|objects| self.destroy_pipeline(objects));
+            self.destroy_pipelines();
             if !self.host.as_ref().is_some_and(|host| host.lends_pipeline_cache) {
                 self.device.destroy_pipeline_cache(self.pipeline_cache, self.callbacks());
             }

@@ -30,7 +30,7 @@ use nightsplat_photographs::tree::check_writable;
 pub use self::cameras::describe;
 use self::pictures::{BRIGHT, PosePhotographs, bright_name, is_dark};
 use self::reconstruction::Reconstruction;
-pub use self::reconstruction::{Mapper, Matcher};
+pub use self::reconstruction::{Features, Mapper, Matcher};
 use self::tool::Tool;
 pub use self::tool::how_to_install;
 use self::unfinished::Unfinished;
@@ -58,6 +58,8 @@ pub struct PoseOptions {
     pub patience: f64,
     /// By default sequential for a clip, else exhaustive.
     pub matcher: Option<Matcher>,
+    /// By default SIFT, then learned ones where few photographs have a camera and this COLMAP has them.
+    pub features: Option<Features>,
     /// The mapper that registers cameras.
     pub mapper: Mapper,
     /// COLMAP options, each `NAME=VALUE`.
@@ -206,14 +208,17 @@ fn posed(
     if let Some(remark) = motion::at_rest(&dark_copies) {
         tracing::warn!("{remark}");
     }
-    let [features, matches, cameras] = expected::seconds(&pictures, matcher);
-    report(PoseProgress::Line(&format!(
-        "{} in all, coarsely: features {}, matching {}, cameras {}",
-        about(features + matches + cameras),
-        about(features),
-        about(matches),
-        about(cameras)
-    )));
+    if options.features != Some(Features::Learned) {
+        let [features, matches, cameras] = expected::seconds(&pictures, matcher);
+        report(PoseProgress::Line(&format!(
+            "{} in all, coarsely: features {}, matching {}, cameras {}",
+            about(features + matches + cameras),
+            about(features),
+            about(matches),
+            about(cameras)
+        )));
+    }
+    reconstruction.plan().into_iter().for_each(|plan| report(PoseProgress::Line(plan)));
     let models = reconstruction.models(&pictures, report)?;
     let largest = Dataset::largest_model(&models, is_dark)?;
     let has_enough = |(_, names): &(PathBuf, Vec<String>)| {

@@ -22,7 +22,7 @@ use crate::results::comparison::{CompareOptions, NamedRenders, RunComparison};
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct CompareArgs {
-    /// Run directories, or models with --dataset; the first is the one that others are compared with
+    /// Run directories and models; the first is the one that others are compared with
     #[arg(required = true)]
     pub runs: Vec<PathBuf>,
     /// Renders of another program, scored as another row: a folder with a picture of every test view, of its size and
@@ -35,7 +35,7 @@ pub struct CompareArgs {
     /// Print JSON instead of tables
     #[arg(long)]
     pub json: bool,
-    /// Dataset, if it moved since training [default: the runs']
+    /// Dataset of models without a run, or if it moved since training [default: the runs']
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
     /// Score models that do not state their tone curve against the dark photographs, even if they are brighter
@@ -54,8 +54,8 @@ pub struct CompareArgs {
 
 const EXAMPLES: &str = "Examples:
   nightsplat compare run1 run2 --report compare.html
-  nightsplat compare run clean.ply --dataset photos       a run and its edited model
-  nightsplat compare run --renders gsplat=other/renders   a run and the renders of another program";
+  nightsplat compare run clean.ply                        a run and its edited model
+  nightsplat compare run --renders gsplat=other/renders   a run and another program's renders";
 
 /// Compares the runs.
 pub fn run(args: &CompareArgs) -> Result<()> {

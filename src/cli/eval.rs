@@ -8,6 +8,7 @@ use nightsplat_core::output::{one_line, write_whole};
 use nightsplat_photographs::dataset::DOWNSCALE;
 use nightsplat_photographs::tree::check_writable;
 
+use super::tell::wrapped;
 use super::{finish, opener, print, progress_bar, with_dataset};
 use crate::Error;
 use crate::gpu::DeviceChoice;
@@ -131,7 +132,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         return Ok(print(format_args!("{:#}", scored.json()))?);
     }
     print(scored.evaluation.table().text())?;
-    scored.notes().iter().try_for_each(|note| print(one_line(note)))?;
+    scored.notes().iter().try_for_each(|note| print(wrapped(&one_line(note), 0)))?;
     let wrote = args.report.iter().chain(&images).map(|path| path.display().to_string());
     let run = with_dataset(&args.run, args.dataset.as_deref());
     let next = format!("nightsplat render {run} --split all --out pictures");

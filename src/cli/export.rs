@@ -22,9 +22,9 @@ use crate::train::CacheSize;
 pub struct ExportArgs {
     /// Run directory, or a model: PLY, SPZ or SOG
     pub run: PathBuf,
-    /// Format
-    #[arg(long, value_name = "FORMAT", value_parser = words::formats())]
-    pub format: Format,
+    /// Format [default: that of the ending of --out]
+    #[arg(long, value_name = "FORMAT", value_parser = words::formats(), required_unless_present = "out")]
+    pub format: Option<Format>,
     /// File to write or replace [default: model.FORMAT in the run]
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
@@ -79,7 +79,7 @@ pub struct ExportArgs {
 const EXAMPLES: &str = "Examples:
   nightsplat export run --format html             run/model.html: a viewer with photographs
   nightsplat export run --format html --max-size 8M --title 'Our attic'
-  nightsplat export run --format spz --out a.spz  a tenth of the size, eight bits per number
+  nightsplat export run --out a.spz               a tenth of the size, eight bits per number
   nightsplat export run --format glb              glTF: KHR_gaussian_splatting
   nightsplat export run --format usda             OpenUSD 26.03; usdz is its package
   nightsplat export run --format streamed-sog     chunks and levels, for large scenes";
@@ -88,7 +88,7 @@ const EXAMPLES: &str = "Examples:
 pub fn run(args: &ExportArgs) -> Result<()> {
     let written = write(args)?;
     let out = word(&written.path);
-    let next = match args.format {
+    let next = match format(args)? {
         Format::Html => format!("open {out} in a browser"),
         Format::Usda | Format::Usdz => {
             format!("open {out} in usdview or an engine with OpenUSD 26.03")
@@ -105,13 +105,16 @@ pub fn run(args: &ExportArgs) -> Result<()> {
 
 /// Writes the file without a message.
 pub(super) fn write(args: &ExportArgs) -> crate::Result<Exported> {
-    check_ending(args)?;
-    check_levels(args)?;
-    check_linear(args)?;
-    check_page(args)?;
+    let format = format(args)?;
+    if let Some(out) = &args.out {
+        check_writable(out)?;
+    }
+    check_levels(args, format)?;
+    check_linear(args, format)?;
+    check_page(args, format)?;
     let options = ExportOptions {
         source: &args.run,
-        format: match args.format {
+        format: match format {
             Format::Spz(_) if args.spz == 3 => Format::Spz(spz::Version::V3),
             format => format,
         },
@@ -163,25 +166,30 @@ fn size_of(path: &Path) -> u64 {
     }
 }
 
-/// Refuses an output file whose ending is that of another format, and one that cannot be written.
-fn check_ending(args: &ExportArgs) -> crate::Result<()> {
-    let Some(out) = &args.out else { return Ok(()) };
+/// The format: the given one, which must agree with the ending of the output file, or else that of the ending.
+fn format(args: &ExportArgs) -> crate::Result<Format> {
+    let out = args.out.as_deref().unwrap_or(Path::new(""));
     let ending = out.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    let named = Format::ALL.map(Format::name).into_iter().find(|name| *name == ending);
-    let chosen = args.format.name();
-    if let Some(other) = named.filter(|name| *name != chosen) {
-        let out = out.display();
-        let problem = format!(
-            "--out {out} is a file of --format {other}, not of --format {chosen}; change either"
-        );
-        return Err(Error::Usage(problem));
-    }
-    check_writable(out)
+    let of_ending = Format::ALL.into_iter().find(|format| format.name() == ending);
+    let out = out.display();
+    let problem = match (args.format, of_ending) {
+        (Some(format), Some(other)) if format.name() != other.name() => format!(
+            "--out {out} is a file of --format {}, not of --format {}; change either",
+            other.name(),
+            format.name()
+        ),
+        (Some(format), _) | (None, Some(format)) => return Ok(format),
+        (None, None) => {
+            let names = Format::ALL.map(Format::name).join(", ");
+            format!("--out {out} has the ending of no format; pass --format: {names}")
+        }
+    };
+    Err(Error::Usage(problem))
 }
 
 /// Refuses options of levels that the format does not have.
-fn check_levels(args: &ExportArgs) -> crate::Result<()> {
-    let is_streamed = args.format == Format::StreamedSog;
+fn check_levels(args: &ExportArgs, format: Format) -> crate::Result<()> {
+    let is_streamed = format == Format::StreamedSog;
     let problem = match args {
         ExportArgs { levels: Some(_), .. } if !is_streamed => {
             "--levels is of --format streamed-sog; pass --level for one level of another format"
@@ -204,12 +212,12 @@ fn check_levels(args: &ExportArgs) -> crate::Result<()> {
 }
 
 /// Refuses what only pages have, and a size of what has a layout of its own.
-fn check_page(args: &ExportArgs) -> crate::Result<()> {
-    let is_sized = !matches!(args.format, Format::Ply | Format::StreamedSog);
+fn check_page(args: &ExportArgs, format: Format) -> crate::Result<()> {
+    let is_sized = !matches!(format, Format::Ply | Format::StreamedSog);
     let has_page_options = args.title.is_some() || args.text.is_some() || args.url.is_some();
     let problem = if args.max_size.is_some() && !is_sized {
         "--max-size is not of --format ply and streamed-sog; pass --level"
-    } else if has_page_options && args.format != Format::Html {
+    } else if has_page_options && format != Format::Html {
         "--title, --text and --url are of --format html"
     } else if args.url.as_ref().is_some_and(|url| !url.starts_with("http")) {
         "--url is an address such as https://example.org/room/"
@@ -221,8 +229,8 @@ fn check_page(args: &ExportArgs) -> crate::Result<()> {
 
 /// Refuses linear light for formats of eight bits, which would show banding, and for model files, whose tone curve is
 /// unknown.
-fn check_linear(args: &ExportArgs) -> crate::Result<()> {
-    let problem = match args.format {
+fn check_linear(args: &ExportArgs, format: Format) -> crate::Result<()> {
+    let problem = match format {
         _ if !args.linear => return Ok(()),
         Format::Spz(_) | Format::Sog | Format::StreamedSog | Format::Html => {
             "--linear needs floats; export to ply, glb or usda".to_owned()

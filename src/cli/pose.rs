@@ -12,7 +12,7 @@ use super::{finish, progress_bar, signals, tell_on_stderr, word};
 use crate::driver;
 use crate::gpu::DeviceChoice;
 use crate::pose::{
-    Mapper, Matcher, PoseOptions, PoseProgress, PoseWatch, Posed, describe, estimate,
+    Features, Mapper, Matcher, PoseOptions, PoseProgress, PoseWatch, Posed, describe, estimate,
 };
 use crate::results::run::Requests;
 
@@ -59,6 +59,10 @@ pub(super) struct PoseChoices {
     /// Match every pair, or neighbours by name [default: sequential for a clip, else exhaustive]
     #[arg(long, value_enum)]
     matcher: Option<Matcher>,
+    /// The features that are matched [default: SIFT, then learned ones where most photographs have no camera and this
+    /// COLMAP has them]
+    #[arg(long, value_enum)]
+    features: Option<Features>,
     /// Register cameras one by one, or all at once, which is faster for many photographs
     #[arg(long, value_enum, default_value_t = Mapper::Incremental)]
     mapper: Mapper,
@@ -149,6 +153,7 @@ impl PoseChoices {
             ffmpeg: choices.ffmpeg,
             patience: choices.patience,
             matcher: choices.matcher,
+            features: choices.features,
             mapper: choices.mapper,
             colmap_options: choices.colmap_option,
             camera_model: choices.camera_model,

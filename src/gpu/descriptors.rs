@@ -35,13 +35,16 @@ impl Descriptors {
     }
 }
 
-/// The sets of one recording; empty where descriptors are pushed.
+/// The sets of one recording, none where descriptors are pushed, and what the last pass has bound.
 #[derive(Debug)]
 pub(super) struct Sets {
     shared: Arc<GpuShared>,
     pools: Vec<vk::DescriptorPool>,
     /// Sets left in the last pool.
     left: u32,
+    /// Where the last pass was recorded, and its kernel, which stays bound with what was pushed for it.
+    last: (vk::CommandBuffer, vk::Pipeline),
+    last_bound: Vec<Bound>,
 }
 
 /// Sets of a pool, each of [`MAX_BUFFERS`] descriptors.
@@ -49,10 +52,12 @@ const SETS_OF_A_POOL: u32 = 64;
 
 impl Sets {
     pub(super) fn new(shared: &Arc<GpuShared>) -> Self {
-        Self { shared: Arc::clone(shared), pools: vec![], left: 0 }
+        let (last, last_bound) = (Default::default(), vec![]);
+        Self { shared: Arc::clone(shared), pools: vec![], left: 0, last, last_bound }
     }
 
-    /// Records into `commands` what the next dispatch binds: pipeline, buffers and parameters.
+    /// Records into `commands` what the next dispatch binds: pipeline, buffers and parameters. A pass of the last one's
+    /// kernel pushes only those buffers that differ.
     pub(super) fn bind(
         &mut self,
         commands: vk::CommandBuffer,
@@ -66,21 +71,33 @@ impl Sets {
             *info = [buffer.range(whole_quads(size))];
         }
         let mut writes = [vk::WriteDescriptorSet::default(); MAX_BUFFERS as usize];
-        let bindings = pipeline.interface.bindings;
-        for ((write, info), binding) in writes.iter_mut().zip(&infos).zip(bindings) {
-            *write = vk::WriteDescriptorSet::default()
+        let is_same = self.last == (commands, pipeline.raw);
+        let is_pushed = matches!(self.shared.descriptors, Descriptors::Pushed(_));
+        let mut count = 0;
+        for (at, (info, binding)) in infos.iter().zip(pipeline.interface.bindings).enumerate() {
+            if is_same && is_pushed && self.last_bound.get(at) == bound.get(at) {
+                continue;
+            }
+            writes[count] = vk::WriteDescriptorSet::default()
                 .dst_binding(binding.index)
                 .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
                 .buffer_info(info);
+            count += 1;
         }
-        let writes = &mut writes[..bindings.len()];
+        let writes = &mut writes[..count];
+        self.last = (commands, pipeline.raw);
+        self.last_bound.clear();
+        self.last_bound.extend_from_slice(bound);
         let (point, layout) = (vk::PipelineBindPoint::COMPUTE, pipeline.layout);
         let shared = Arc::clone(&self.shared);
         let device = &shared.device;
         // SAFETY: recording; pipeline and buffers are live and match the layout by construction.
         unsafe {
-            device.cmd_bind_pipeline(commands, point, pipeline.raw);
+            if !is_same {
+                device.cmd_bind_pipeline(commands, point, pipeline.raw);
+            }
             match &shared.descriptors {
+                Descriptors::Pushed(_) if writes.is_empty() => {}
                 Descriptors::Pushed(functions) => {
                     functions.cmd_push_descriptor_set(commands, point, layout, 0, writes);
                 }

@@ -20,7 +20,7 @@ pub struct Binding {
 }
 
 /// A buffer that a dispatch binds.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Bound {
     /// The Vulkan buffer.
     pub raw: vk::Buffer,

@@ -3,7 +3,6 @@
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use std::io::Cursor;
-use std::sync::Arc;
 
 use ash::vk;
 use nightsplat_core::watch::Stage;
@@ -20,7 +19,6 @@ pub struct Pipeline<K: Kernel> {
     /// What it is specialised for.
     pub(super) constants: K::Constants,
     pub(super) objects: Objects,
-    pub(super) shared: Arc<GpuShared>,
 }
 
 /// The Vulkan objects of a kernel with its constants. A device compiles them once and keeps them to its end: trainers
@@ -41,9 +39,9 @@ impl Gpu {
     #[doc(hidden)]
     pub fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
         let objects = self.objects(K::INTERFACE, K::constants(constants))?;
-        let pipeline = Pipeline { constants: *constants, objects, shared: self.shared.clone() };
+        let pipeline: Pipeline<K> = Pipeline { constants: *constants, objects };
         if let Some(file) = statistics::file() {
-            let all = pipeline.statistics()?.unwrap_or_default();
+            let all = pipeline.statistics(self)?.unwrap_or_default();
             let kernel = K::INTERFACE.name;
             statistics::log(&file, kernel, constants, &self.shared.properties, &all)?;
         }
@@ -123,9 +121,9 @@ fn compiled(
 }
 
 impl<K: Kernel> Pipeline<K> {
-    /// The driver's statistics of the kernel; `None` where the driver has none. Compiles it again.
-    pub fn statistics(&self) -> Result<Option<Vec<Statistic>>> {
-        let shared = &self.shared;
+    /// The statistics of the kernel by the driver of its device; `None` where the driver has none. Compiles it again.
+    pub fn statistics(&self, gpu: &Gpu) -> Result<Option<Vec<Statistic>>> {
+        let shared = &gpu.shared;
         let Some(functions) = &shared.executables else { return Ok(None) };
         let fail = |call| move |result| shared.error(call, result);
         let constants = K::constants(&self.constants);
@@ -276,9 +274,20 @@ unsafe fn raw_pipeline(
 }
 
 impl GpuShared {
+    /// Destroys every kernel that was compiled.
+    ///
+    /// # Safety
+    /// No submission uses one any more, and nothing records one.
+    pub(super) unsafe fn destroy_pipelines(&self) {
+        for objects in std::mem::take(&mut *lock(&self.pipelines)).values() {
+            // SAFETY: as the caller promises.
+            unsafe { self.destroy_pipeline(objects) };
+        }
+    }
+
     /// # Safety
     /// No submission uses the pipeline any more, and it is destroyed once.
-    pub(super) unsafe fn destroy_pipeline(&self, objects: &Objects) {
+    unsafe fn destroy_pipeline(&self, objects: &Objects) {
         let callbacks = self.callbacks();
         // SAFETY: as the caller promises.
         unsafe {

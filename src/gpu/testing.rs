@@ -95,9 +95,8 @@ fn open(adapt: impl FnOnce(&mut GpuShared)) -> Gpu {
             std::env::var_os(AS_A_GPU_VARIABLE).is_none_or(|value| value.is_empty());
         adapt(shared);
         // What was compiled so far was for other properties.
-        let compiled = std::mem::take(&mut *super::lock(&shared.pipelines));
         // SAFETY: nothing was submitted since the self-test, which waits for its end.
-        compiled.values().for_each(|objects| unsafe { shared.destroy_pipeline(objects) });
+        unsafe { shared.destroy_pipelines() };
     }
     gpu
 }

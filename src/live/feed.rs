@@ -149,6 +149,12 @@ impl Feed {
         (state.version > 0).then(|| state.model.clone())
     }
 
+    /// The file of the model, as it was saved last; `None` if there is none.
+    pub(super) fn saved(&self) -> Option<Bytes> {
+        let path = self.lock().path()?;
+        std::fs::read(path).ok().map(Bytes::from)
+    }
+
     /// Progress and the version of the model, as JSON. A page that asks is being watched, so a training in this process
     /// is asked for a snapshot.
     pub(super) fn state(&self) -> Value {
@@ -183,6 +189,7 @@ impl Feed {
         told["fingerprint"] = state.fingerprint.clone().into();
         told["canControl"] = self.requests.is_some().into();
         told["problem"] = state.problem.clone().into();
+        told["file"] = state.path().as_deref().and_then(saved_file).into();
         if state.ended.is_some() {
             (told["endedBy"], told["canControl"]) = (state.ended.clone().into(), false.into());
         }
@@ -213,12 +220,21 @@ impl FeedState {
         }
     }
 
+    /// The file of the model.
+    fn path(&self) -> Option<PathBuf> {
+        match &self.source {
+            FeedSource::Run(run) => Some(run.path().join("model.ply")),
+            FeedSource::File(path) => Some(path.clone()),
+            FeedSource::Fixed => None,
+        }
+    }
+
     /// Reads the model file if it has changed. A file that has vanished or is damaged leaves the last model.
     fn read(&mut self) {
-        let (path, from) = match &self.source {
-            FeedSource::Run(run) => (run.path().join("model.ply"), run.path().to_owned()),
-            FeedSource::File(path) => (path.clone(), path.clone()),
-            FeedSource::Fixed => return,
+        let Some(path) = self.path() else { return };
+        let from = match &self.source {
+            FeedSource::Run(run) => run.path().to_owned(),
+            _ => path.clone(),
         };
         match stamp(&path) {
             Ok(found) if self.file == Some(found) => self.problem = None,
@@ -250,6 +266,13 @@ impl FeedState {
         (self.step, self.problem) = (step, None);
         self.version += 1;
     }
+}
+
+/// The name of a file, and what changes when it is written.
+fn saved_file(path: &Path) -> Option<Value> {
+    let (time, bytes) = stamp(path).ok()?;
+    let name = path.file_name()?.to_string_lossy();
+    Some(json!({ "name": name, "saved": format!("{time:?} {bytes}") }))
 }
 
 /// The `most` Gaussians with the largest product of opacity and area, in their order.
@@ -320,7 +343,11 @@ mod tests {
         assert_eq!((shown["model"].as_u64(), shown["fingerprint"].is_string()), (Some(2), true));
         let first = feed.model().unwrap();
         assert_eq!(state()["model"], 2);
+        assert_eq!(feed.saved().unwrap(), std::fs::read(&path).unwrap());
+        let before = state()["file"].clone();
+        assert_eq!(before["name"], "model.ply");
         model(&[1.0, 2.0]).save(&path).unwrap();
+        assert_ne!(state()["file"], before);
         assert_eq!(state()["model"], 3);
         assert_ne!(feed.model().unwrap(), first);
         std::fs::write(&path, "ply\n").unwrap();
@@ -328,6 +355,7 @@ mod tests {
         std::fs::remove_file(&path).unwrap();
         let gone = state();
         assert!(gone["problem"].as_str().unwrap().contains("is gone"), "{gone}");
+        assert!(gone["file"].is_null() && feed.saved().is_none());
         assert_eq!((gone["model"].as_u64(), gone["canControl"].as_bool()), (Some(3), Some(false)));
         assert!(!feed.follow("stop"));
     }

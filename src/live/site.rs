@@ -51,6 +51,7 @@ impl Site {
     /// | | the page |
     /// | `state` | the progress, as JSON |
     /// | `model` | the model, as the viewer reads it |
+    /// | `file` | the file of the model, whole, as it was saved last |
     /// | `picture/VIEW/KIND` | a photograph, target or reference image, as JPEG |
     /// | `do/WHAT` (POST) | pause, resume, save, finish or stop |
     pub(super) fn answer(&self, method: &Method, path: &str) -> Answer {
@@ -62,6 +63,10 @@ impl Site {
             }
             ("GET", ["model"]) => match self.feed.model() {
                 Some(model) => Answer::ok("application/octet-stream", model),
+                None => Answer::NOT_FOUND,
+            },
+            ("GET", ["file"]) => match self.feed.saved() {
+                Some(file) => Answer::ok("application/octet-stream", file),
                 None => Answer::NOT_FOUND,
             },
             ("GET", ["picture", view, kind]) => self.picture(view, kind),

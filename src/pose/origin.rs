@@ -10,7 +10,8 @@ use super::PoseOptions;
 
 /// The line of these options, with a checksum of names, sizes and times of all files.
 pub(super) fn line(options: &PoseOptions) -> String {
-    let PoseOptions { photos, with, matcher, mapper, camera_model, fps, light, .. } = options;
+    let PoseOptions { photos, with, matcher, features, mapper, camera_model, fps, light, .. } =
+        options;
     let mut hasher = Hasher::default();
     let mut count = 0;
     for folder in [Some(photos), with.as_ref()].into_iter().flatten() {
@@ -22,7 +23,7 @@ pub(super) fn line(options: &PoseOptions) -> String {
         }
     }
     let chosen = format!(
-        "{matcher:?} {mapper:?} {camera_model} {fps} {light:?} {:?}",
+        "{matcher:?} {features:?} {mapper:?} {camera_model} {fps} {light:?} {:?}",
         options.colmap_options
     );
     hasher.write(chosen.as_bytes());

@@ -32,6 +32,15 @@ impl Matcher {
     }
 }
 
+/// The features that are found in photographs, and matched.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Features {
+    /// SIFT, matched by distance
+    Sift,
+    /// ALIKED, matched by LightGlue: networks that COLMAP fetches once (COLMAP from 4.0 on, built with ONNX)
+    Learned,
+}
+
 /// The mapper that registers cameras.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Mapper {
@@ -50,6 +59,9 @@ pub(super) struct Reconstruction<'a> {
     /// How many, dark and bright.
     photographs: usize,
     matcher: Matcher,
+    features: Features,
+    /// Whether this COLMAP has learned features.
+    can_learn: bool,
     /// Whether matching uses the two-view geometry that it found before.
     is_guided: bool,
     /// Options of the mapper that relax the choice of the initial pair.
@@ -59,14 +71,33 @@ pub(super) struct Reconstruction<'a> {
     out: &'a Unfinished,
     /// The end of the time for further attempts.
     until: Option<Instant>,
+    /// Of the features, with their matches.
     database: PathBuf,
     models: PathBuf,
 }
 
-/// The number of dark photographs in the model with the most of them.
-fn placed_in(models: &Path) -> Result<usize> {
-    let largest = Dataset::largest_model(models, is_dark)?;
-    Ok(largest.map_or(0, |(_, placed)| placed.iter().filter(|name| is_dark(name)).count()))
+/// The models of an attempt, and the number of dark photographs in the one with the most of them.
+struct Attempt {
+    models: PathBuf,
+    placed: usize,
+}
+
+impl Attempt {
+    fn of(models: &Path) -> Result<Self> {
+        let largest = Dataset::largest_model(models, is_dark)?;
+        let placed =
+            largest.map_or(0, |(_, placed)| placed.iter().filter(|name| is_dark(name)).count());
+        Ok(Self { models: models.to_owned(), placed })
+    }
+
+    /// Takes another that has more.
+    fn improve(&mut self, models: &Path) -> Result<()> {
+        let found = Self::of(models)?;
+        if found.placed > self.placed {
+            *self = found;
+        }
+        Ok(())
+    }
 }
 
 /// Relaxations of the initial pair, for few photographs: a smaller baseline, motion along the viewing direction, and
@@ -80,8 +111,13 @@ const RELAXED: [&[(&str, &str)]; 2] = [
     ],
 ];
 
-/// The least time of a first attempt that those after it are measured by, seconds.
-const LEAST_FIRST: f64 = 15.0;
+/// The least time of a first attempt that those after it are measured by, seconds: enough to fetch networks.
+const LEAST_FIRST: f64 = 60.0;
+
+/// The option of learned features in `feature_extractor`, and what a COLMAP prints that cannot use them.
+const LEARNED_OPTION: &str = "AlikedExtraction.max_num_features";
+const NO_NETWORKS: &str = "requires ONNX support";
+const NOT_FETCHED: [&str; 2] = ["Failed to download file", "Download failed after"];
 
 /// Options with their values.
 type Options = Vec<(String, OsString)>;
@@ -98,7 +134,12 @@ impl<'a> Reconstruction<'a> {
         let needs_glomap = is_global && !colmap.help_contains(&["help"], GLOBAL);
         let glomap = || colmap.beside(&settings.glomap, "glomap").found();
         let glomap = needs_glomap.then(glomap).transpose()?;
-        let (database, models) = (out.work.join("database.db"), out.work.join("sparse"));
+        let can_learn = colmap.has_option("feature_extractor", LEARNED_OPTION);
+        if settings.features == Some(Features::Learned) && !can_learn {
+            let problem = "--features learned: this COLMAP has no ALIKED features; name COLMAP 4.0 or later with \
+                           --colmap PATH, or take --features sift";
+            return Err(Error::Usage(problem.to_owned()));
+        }
         let mapper = if is_global && !needs_glomap { GLOBAL } else { "mapper" };
         let commands = ["feature_extractor", matcher.command(), mapper];
         let mut user_options = vec![];
@@ -126,99 +167,177 @@ impl<'a> Reconstruction<'a> {
             options: settings,
             photographs: 0,
             matcher,
+            features: settings.features.unwrap_or(Features::Sift),
+            can_learn,
             is_guided: false,
             relaxed: &[],
             user_options,
             out,
             until: None,
-            database,
-            models,
+            database: PathBuf::new(),
+            models: PathBuf::new(),
         })
     }
 
-    /// The folder of the models, each a folder; it is empty if nothing could be reconstructed. If more than a tenth of
-    /// the dark photographs have no camera, all are matched again, guided: without it, the result of a small set
-    /// depends on chance; always matching guided would double the time of a large one. If most still have none, the
-    /// choice of the initial pair is relaxed. All of this together takes [`PoseOptions::patience`] times the time of
-    /// the first attempt at most. Stages that an earlier call has done are not repeated.
+    /// The features of the attempts, in a line.
+    pub(super) fn plan(&self) -> Option<&'static str> {
+        match (self.features, self.tries_learned()) {
+            (Features::Learned, _) => Some("learned features: ALIKED, matched by LightGlue"),
+            (_, true) => {
+                Some("SIFT features; if most photographs have no camera, learned ones too")
+            }
+            _ => None,
+        }
+    }
+
+    /// Whether the first attempt, if it finds few, is followed by one with learned features.
+    fn tries_learned(&self) -> bool {
+        self.options.features.is_none() && self.can_learn
+    }
+
+    /// The folder of the models, each a folder; it is empty if nothing could be reconstructed.
+    ///
+    /// If most of the dark photographs have no camera, learned features are tried where this COLMAP has them, and kept
+    /// if they give more. If more than a tenth have none, all are matched again, guided: without it, the result of a
+    /// small set depends on chance; always matching guided would double the time of a large one. If most still have
+    /// none, the choice of the initial pair is relaxed. All of this together takes [`PoseOptions::patience`] times the
+    /// time of the first attempt at most. Stages that an earlier call has done are not repeated.
     pub(super) fn models(
         mut self,
         pictures: &PosePhotographs,
         report: &dyn Fn(PoseProgress<'_>),
     ) -> Result<PathBuf> {
-        let copies = pictures.copies.as_path();
         self.photographs = pictures.dark.len() + pictures.bright.len();
-        let features = self.out.work.join("guided.db");
-        self.once("features", || self.extract(pictures, &features, report))?;
-        self.once("matching", || self.match_features(report))?;
-        self.once("registering", || self.register(copies, report))?;
+        self.attempt(pictures, report)?;
         let all = pictures.dark.len();
-        let mut placed = placed_in(&self.models)?;
-        let mut best = self.models.clone();
-        if 10 * placed >= 9 * all {
-            return Ok(best);
+        let mut best = Attempt::of(&self.models)?;
+        if 10 * best.placed >= 9 * all || self.options.patience == 0.0 {
+            return Ok(best.models);
         }
-        let first = ["matching", "registering"].map(|stage| self.out.seconds_of(stage));
+        let first = ["matching", "registering"].map(|stage| self.seconds_of(stage));
         let first: f64 = first.into_iter().flatten().sum();
-        if self.options.patience == 0.0 {
-            return Ok(best);
-        }
         let patience = Duration::from_secs_f64(self.options.patience * first.max(LEAST_FIRST));
         self.until = Some(Instant::now() + patience);
-        let line = format!(
-            "{placed} of {all} have a camera: matching again, guided, for at most {}",
-            duration(patience.as_secs_f64())
-        );
-        report(PoseProgress::Line(&line));
-        self.is_guided = true;
-        self.models = self.out.work.join("guided");
-        self.database = features;
-        let again = self.once("guided-matching", || self.match_features(report));
-        match again.and_then(|()| self.once("guided", || self.register(copies, report))) {
-            Err(error) if error.is_stop() => return Err(error),
-            // The models of the first attempt are still there.
-            Err(error) if placed > 0 => {
-                tracing::warn!("{error}; using the cameras of the first attempt");
-                return Ok(best);
+        let most = duration(patience.as_secs_f64());
+        let again = |placed: usize, how: &str| {
+            report(PoseProgress::Line(&format!("{placed} of {all} have a camera: {how}")));
+        };
+        if 2 * best.placed < all && self.tries_learned() {
+            again(best.placed, &format!("learned features, for at most {most}"));
+            self.features = Features::Learned;
+            match self.attempt(pictures, report) {
+                Err(error) if error.is_stop() => return Err(error),
+                Err(error) => tracing::warn!("{error}; going on with SIFT"),
+                Ok(()) => best.improve(&self.models)?,
             }
-            outcome => outcome?,
+            if best.models != self.models {
+                self.features = Features::Sift;
+            }
         }
-        for (step, relaxed) in [&[][..]].into_iter().chain(RELAXED).enumerate() {
-            if !relaxed.is_empty() {
-                if 2 * placed >= all || self.options.mapper == Mapper::Global || self.is_late() {
-                    break;
+        if 10 * best.placed < 9 * all && !self.is_late() {
+            again(best.placed, &format!("matching again, guided, for at most {most}"));
+            match self.guided(&pictures.copies, report) {
+                Err(error) if error.is_stop() => return Err(error),
+                // There are still models of an attempt.
+                Err(error) if best.placed > 0 => {
+                    tracing::warn!("{error}; using the cameras found so far");
+                    return Ok(best.models);
                 }
-                let line = format!(
-                    "{placed} of {all} have a camera: registering again, from a closer pair"
-                );
-                report(PoseProgress::Line(&line));
-                self.relaxed = relaxed;
-                let name = format!("relaxed{step}");
-                self.models = self.out.work.join(&name);
-                self.once(&name, || self.register(copies, report))?;
+                outcome => outcome?,
             }
-            let found = placed_in(&self.models)?;
-            if found > placed {
-                (placed, best) = (found, self.models.clone());
+            best.improve(&self.models)?;
+        }
+        for (step, relaxed) in (1..).zip(RELAXED) {
+            if 2 * best.placed >= all || self.options.mapper == Mapper::Global || self.is_late() {
+                break;
             }
+            again(best.placed, "registering again, from a closer pair");
+            self.relaxed = relaxed;
+            let stage = format!("relaxed{step}");
+            self.models = self.file(&stage);
+            self.once(&stage, || self.register(&pictures.copies, report))?;
+            best.improve(&self.models)?;
         }
         if self.is_late() {
             report(PoseProgress::Line(&format!(
-                "{placed} of {all} have a camera, and the time for further attempts is up (--patience {} allows more)",
+                "{} of {all} have a camera, and the time for further attempts is up (--patience {} allows more)",
+                best.placed,
                 2.0 * self.options.patience
             )));
         }
-        Ok(best)
+        if 2 * best.placed < all && !self.can_learn {
+            report(PoseProgress::Line(
+                "COLMAP 4 has learned features, which find more in dark photographs; this one has none",
+            ));
+        }
+        Ok(best.models)
+    }
+
+    /// Features, matches and cameras.
+    fn attempt(
+        &mut self,
+        pictures: &PosePhotographs,
+        report: &dyn Fn(PoseProgress<'_>),
+    ) -> Result<()> {
+        (self.database, self.models) = (self.file("database.db"), self.file("sparse"));
+        let attempt = self
+            .once("features", || self.extract(pictures, report))
+            .and_then(|()| self.once("matching", || self.match_features(report)));
+        attempt.map_err(|error| self.without_networks(error))?;
+        self.once("registering", || self.register(&pictures.copies, report))
+    }
+
+    /// Matches the features again, and registers cameras.
+    fn guided(&mut self, copies: &Path, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
+        self.is_guided = true;
+        (self.database, self.models) = (self.file("guided.db"), self.file("guided"));
+        self.once("guided-matching", || self.match_features(report))?;
+        self.once("guided", || self.register(copies, report))
+    }
+
+    /// A file of the attempts with these features.
+    fn file(&self, name: &str) -> PathBuf {
+        self.out.work.join(self.stage(name))
+    }
+
+    /// The name of a stage with these features.
+    fn stage(&self, name: &str) -> String {
+        match self.features {
+            Features::Sift => name.to_owned(),
+            Features::Learned => format!("learned-{name}"),
+        }
+    }
+
+    fn seconds_of(&self, stage: &str) -> Option<f64> {
+        self.out.seconds_of(&self.stage(stage))
+    }
+
+    /// An error, with the remedy where it is that COLMAP has no networks.
+    fn without_networks(&self, error: Error) -> Error {
+        if error.is_stop() || self.features == Features::Sift {
+            return error;
+        }
+        let problem = if self.colmap.printed(NO_NETWORKS) {
+            "this COLMAP is built without ONNX, which learned features need; take one that has it \
+             (-DONNX_ENABLED=ON), or --features sift"
+        } else if NOT_FETCHED.iter().any(|words| self.colmap.printed(words)) {
+            "COLMAP could not fetch the networks of ALIKED and LightGlue; connect for the first call, or name files with \
+             --colmap-option AlikedExtraction.n16rot_model_path=FILE and AlikedMatching.lightglue_model_path=FILE"
+        } else {
+            return error;
+        };
+        Error::Usage(format!("--features learned: {problem}"))
     }
 
     /// Does a stage that no earlier call has done. One that ran out of time is not done.
     fn once(&self, stage: &str, work: impl FnOnce() -> Result<()>) -> Result<()> {
-        if self.out.seconds_of(stage).is_some() {
+        if self.seconds_of(stage).is_some() {
             return Ok(());
         }
         let begin = Instant::now();
         work()?;
-        if self.is_late() { Ok(()) } else { self.out.done(stage, begin.elapsed().as_secs_f64()) }
+        let seconds = begin.elapsed().as_secs_f64();
+        if self.is_late() { Ok(()) } else { self.out.done(&self.stage(stage), seconds) }
     }
 
     /// Whether the time for further attempts is up.
@@ -226,15 +345,10 @@ impl<'a> Reconstruction<'a> {
         self.until.is_some_and(|until| until <= Instant::now())
     }
 
-    /// Extracts the features of each photograph into the database, and copies that to `features`: COLMAP matches no
-    /// pair twice, so matching again begins with the features alone. Those of one group share a camera, for which an
-    /// interrupted call has to begin anew.
-    fn extract(
-        &self,
-        pictures: &PosePhotographs,
-        features: &Path,
-        report: &dyn Fn(PoseProgress<'_>),
-    ) -> Result<()> {
+    /// Extracts the features of each photograph into the database, and copies that: COLMAP matches no pair twice, so
+    /// matching again begins with the features alone. Those of one group share a camera, for which an interrupted call
+    /// has to begin anew.
+    fn extract(&self, pictures: &PosePhotographs, report: &dyn Fn(PoseProgress<'_>)) -> Result<()> {
         for ending in ["", "-shm", "-wal"] {
             let mut file = self.database.as_os_str().to_owned();
             file.push(ending);
@@ -260,6 +374,9 @@ impl<'a> Reconstruction<'a> {
                 ("ImageReader.camera_model".to_owned(), self.options.camera_model.as_str().into()),
                 (use_gpu.clone(), self.gpu().into()),
             ]);
+            if self.features == Features::Learned {
+                options.push(("FeatureExtraction.type".to_owned(), "ALIKED_N16ROT".into()));
+            }
             if pictures.masks.is_dir() {
                 options.push(("ImageReader.mask_path".to_owned(), pictures.masks.clone().into()));
             }
@@ -273,15 +390,15 @@ impl<'a> Reconstruction<'a> {
             self.run(&self.colmap, command, options, "features", report)?;
         }
         if self.database.is_file() {
-            std::fs::copy(&self.database, features)
-                .map_err(|error| Error::output(features, format!("cannot be written: {error}")))?;
+            let copy = self.file("guided.db");
+            std::fs::copy(&self.database, &copy)
+                .map_err(|error| Error::output(&copy, format!("cannot be written: {error}")))?;
         }
-        report(PoseProgress::Line(&match runs.len() {
-            1 => "features extracted".to_owned(),
-            count => format!(
-                "features extracted; {count} groups of photographs by size, lens and focal length"
-            ),
-        }));
+        let groups = match runs.len() {
+            1 => String::new(),
+            count => format!("; {count} groups of photographs by size, lens and focal length"),
+        };
+        self.tell(&format!("features extracted{groups}"), report);
         Ok(())
     }
 
@@ -290,6 +407,9 @@ impl<'a> Reconstruction<'a> {
         let of_matching = |option| self.named(command, ["FeatureMatching", "SiftMatching"], option);
         let mut options = vec![("database_path".to_owned(), self.database.clone().into())];
         options.push((of_matching("use_gpu"), self.gpu().into()));
+        if self.features == Features::Learned {
+            options.push(("FeatureMatching.type".to_owned(), "ALIKED_LIGHTGLUE".into()));
+        }
         // With the relative pose of two photographs, more of their features are matched.
         if self.is_guided {
             options.push((of_matching("guided_matching"), "1".into()));

@@ -89,6 +89,10 @@ impl RunComparison {
     /// first run.
     pub(crate) fn new(paths: &[PathBuf], options: &CompareOptions<'_>) -> Result<Self> {
         let names = names(paths);
+        // A model file is seen by the views of the run beside it.
+        let run =
+            paths.iter().find(|path| !is_model(path)).and_then(|run| run::load_config(run).ok());
+        let of_run = run.map(|config| config.dataset);
         let mut first: Option<(Gpu, Dataset, ScoreReference)> = None;
         let mut comparison = Self { runs: vec![], measure: None, pictures: vec![] };
         let mut targets = None;
@@ -99,7 +103,8 @@ impl RunComparison {
                 let changed = stated.and_then(|stated| config.with_targets(&stated).ok());
                 *config = changed.unwrap_or_else(|| config.clone());
             };
-            let opened = FinishedRun::open_lit(path, options.dataset, &options.opener, change)?;
+            let dataset = options.dataset.or(of_run.as_deref().filter(|_| is_model(path)));
+            let opened = FinishedRun::open_lit(path, dataset, &options.opener, change)?;
             let states_targets = opened.states_targets;
             let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, .. } =
                 opened;

@@ -60,12 +60,10 @@ impl ReferenceKind {
         match self {
             Self::References => None,
             Self::PseudoGt => Some(
-                "against their own pseudo-GT, as there are no reference images: how well the model reproduces its \
-                 targets, not how right these are; runs of different curves do not compare",
+                "against their own pseudo-GT: how well the model fits its targets, not how right these are",
             ),
             Self::ExternalTargets => Some(
-                "against the targets of another program, as there are no reference images: how well the model \
-                 reproduces them, not how right these are; they compare with no other targets",
+                "against the targets of another program: how well the model fits them, not how right these are",
             ),
             Self::Photographs => Some(
                 "against the photographs themselves, as there are no reference images and no curve",

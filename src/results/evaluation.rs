@@ -179,8 +179,9 @@ impl RunEvaluation {
             )
         });
         let reference = self.config.tone.knows_references().map(|known| with_reference(&known));
+        let verdict = verdict::of_model(&self.evaluation);
         let label = self.evaluation.label().map(str::to_owned);
-        [reference, lit, slope, label].into_iter().flatten().collect()
+        [reference, lit, slope, verdict, label].into_iter().flatten().collect()
     }
 
     /// The page of the run.

@@ -155,9 +155,9 @@ impl Renderer {
 
     /// The driver's statistics of the blending kernels, forward and backward; empty where it has none.
     pub(crate) fn blend_statistics(&self) -> Result<Option<[Vec<Statistic>; 2]>> {
-        let forward = self.blend_forward.statistics()?;
+        let forward = self.blend_forward.statistics(&self.gpu)?;
         let backward = match &self.blend_backward {
-            Some(backward) => backward.statistics()?,
+            Some(backward) => backward.statistics(&self.gpu)?,
             None => None,
         };
         Ok(forward.zip(backward).map(<[_; 2]>::from))

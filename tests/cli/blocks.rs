@@ -84,7 +84,7 @@ fn the_joined_tiles_are_those_of_the_cores_and_are_opened_like_a_run() {
     let scores = json(shared.succeed("eval @city --json"));
     assert_eq!(scores["gaussians"].as_u64(), Some(counts));
     assert!(scores["mean"]["psnr"].as_f64().unwrap() > 12.0, "{}", scores["mean"]);
-    shared.succeed("export @city --format ply --out @city.ply");
+    shared.succeed("export @city --out @city.ply");
     let exported = String::from_utf8_lossy(&shared.read("city.ply")).into_owned();
     assert!(exported.contains(&format!("element vertex {counts}\n")));
     // Tile by tile, in two levels of the same cells.

@@ -117,6 +117,10 @@ fn misuse_is_one_line_with_exit_code_2() {
         2 | train | --out & required
         2 | evaluate x | evaluate
         2 | render x --split none --out y | none & train, test, all
+        2 | export @run | --format
+        2 | export @run --out model | pass --format: ply, spz, glb
+        2 | export @run --out model.xyz | model.xyz has the ending of no format
+        2 | export @run --format spz --out a.ply | a.ply is a file of --format ply
         2 | bench --repeats 0 | --repeats
         2 | bench --precision 8 | precision.rest & 32 or 16
         2 | bench model.ply --gaussians 7 | --gaussians

@@ -12,6 +12,8 @@ use crate::common::not_run;
 use crate::common::prelude::*;
 
 // Opcodes and enumerants of the SPIR-V specification.
+/// From `OpSourceContinued` to `OpLine`.
+const OP_DEBUG: std::ops::RangeInclusive<u32> = 2..=8;
 const OP_EXECUTION_MODE: u32 = 16;
 const OP_TYPE_VECTOR: u32 = 23;
 const OP_TYPE_ARRAY: u32 = 28;
@@ -49,6 +51,15 @@ fn backward(channels: u32, subgroups_per_tile: u32, lanes: u32) -> Vec<u32> {
     };
     let constants = blend_backward::Kernel::constants(&constants);
     frozen(blend_backward::Kernel::INTERFACE, constants, lanes).unwrap()
+}
+
+#[test]
+fn no_kernel_is_shipped_with_names_for_debuggers() {
+    for (interface, module) in all() {
+        let names =
+            instructions(&module).iter().filter(|(opcode, _)| OP_DEBUG.contains(opcode)).count();
+        assert_eq!(names, 0, "{}", interface.name);
+    }
 }
 
 #[test]

@@ -351,9 +351,11 @@ fn a_photograph_of_one_channel_has_the_brightness_of_that_channel() {
 
 #[test]
 fn noise_that_reaches_below_black_hardly_changes_the_gain() {
-    // Light that changes slowly, in three colours.
-    let light =
-        |i: usize| 0.002 + 0.01 * (i % 4096) as f32 / 4096.0 * (1.0 - 0.2 * (i / 20_000) as f32);
+    // Light that changes slowly, in three colours, with a fine texture.
+    let light = |i: usize| {
+        let slow = 0.002 + 0.01 * (i % 4096) as f32 / 4096.0 * (1.0 - 0.2 * (i / 20_000) as f32);
+        slow * if i % 8 < 4 { 1.4 } else { 0.6 }
+    };
     let clean: Vec<f32> = (0..60_000).map(light).collect();
     let median = 0.006;
     let stream = Stream::new(1, 1);

@@ -40,8 +40,7 @@ fn a_model_file_has_the_targets_of_its_run_in_every_format() {
             .map(|scores| scores["views"].as_object().unwrap().keys().cloned().collect::<Vec<_>>());
         assert_eq!(views, views_of_run, "{file}");
     }
-    let compared =
-        workspace.succeed(&format!("compare {run_folder} {clean} --dataset {set} --json"));
+    let compared = workspace.succeed(&format!("compare {run_folder} {clean} --json"));
     let compared = json(&compared);
     assert!((psnr(&compared["runs"][0]) - psnr(&compared["runs"][1])).abs() < 1e-3, "{compared}");
     // A file that states nothing is loaded as the run, and scored against its targets.

@@ -24,6 +24,7 @@ pub(super) fn stub(folder: &Path, cases: &str) -> PathBuf {
          fi\n\
          while [ $# -gt 0 ]; do\n\
          case $1 in\n\
+         --database_path) database=$2;;\n\
          --image_path) images=$2;;\n\
          --output_path) output=$2;;\n\
          --image_list_path) list=$2;;\n\
@@ -37,6 +38,17 @@ pub(super) fn stub(folder: &Path, cases: &str) -> PathBuf {
          esac\n"
     );
     script(&path, &lines);
+    path
+}
+
+/// A [`stub`] that lists learned features.
+pub(super) fn learned_stub(folder: &Path, cases: &str) -> PathBuf {
+    let path = stub(folder, cases);
+    let option = "  --AlikedExtraction.max_num_features arg (=2048)";
+    let lines = fs::read_to_string(&path).unwrap();
+    let help =
+        format!("[ $command = feature_extractor ] && echo '{option}'\n[ $command = mapper ] &&");
+    fs::write(&path, lines.replacen("[ $command = mapper ] &&", &help, 1)).unwrap();
     path
 }
 
@@ -146,7 +158,7 @@ fn a_failed_second_matching_keeps_the_cameras_of_the_first() {
     let arguments = line(&photos, &out, &colmap, "");
     let (stdout, stderr) = run(&arguments, 0);
     assert!(stdout.contains("8 of 9 photographs"), "{stdout}");
-    assert!(stderr.contains("using the cameras of the first attempt"), "{stderr}");
+    assert!(stderr.contains("using the cameras found so far"), "{stderr}");
 }
 
 #[test]

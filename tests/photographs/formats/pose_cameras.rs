@@ -7,7 +7,7 @@ use std::path::Path;
 use nightsplat_photographs::image::{Image, ImageFile};
 
 use super::load;
-use super::pose::{line, models, photographed, stub};
+use super::pose::{learned_stub, line, models, photographed, stub};
 use super::synthetic::*;
 use crate::common::command::{refused, run};
 
@@ -206,6 +206,80 @@ fn few_photographs_start_from_a_closer_pair_and_options_go_to_their_command() {
         ("Mapper.init_min_tri_angle", ["Mapper.init_min_tri_angle", "is not NAME=VALUE"]),
     ] {
         refused(&pose(&asked, &format!("--colmap-option {option}")), 2, &parts);
+    }
+}
+
+#[test]
+fn learned_features_are_tried_where_most_photographs_have_no_camera() {
+    let root = &Folder::empty();
+    let (photos, out) = (photographed(root), root.join("scene"));
+    model(4).write_binary(&root.join("few/0"));
+    model(9).write_binary(&root.join("all/0"));
+    let cases = format!(
+        "mapper) case $database in */learned-*) cp -r {0}/all/* $output;; *) cp -r {0}/few/* $output;; esac;;",
+        root.display()
+    );
+    let (stdout, stderr) = run(&line(&photos, &out, &learned_stub(root, &cases), ""), 0);
+    assert!(stdout.contains("9 of 9 photographs"), "{stdout}");
+    let plan = "SIFT features; if most photographs have no camera, learned ones too";
+    for told in [plan, "4 of 9 have a camera: learned features, for at most 2 min"] {
+        assert!(stderr.contains(told), "no `{told}` in: {stderr}");
+    }
+    assert!(!stderr.contains("matching again"), "{stderr}");
+    let log = fs::read_to_string(out.join("colmap.log")).unwrap();
+    for option in
+        ["--FeatureExtraction.type ALIKED_N16ROT", "--FeatureMatching.type ALIKED_LIGHTGLUE"]
+    {
+        assert_eq!(log.matches(option).count(), 1, "{option}: {log}");
+    }
+
+    // On request, they are the first and only ones.
+    let learned = "--overwrite --features learned";
+    let (_, stderr) = run(&line(&photos, &out, &learned_stub(root, &cases), learned), 0);
+    assert!(stderr.contains("learned features: ALIKED, matched by LightGlue"), "{stderr}");
+    let log = fs::read_to_string(out.join("colmap.log")).unwrap();
+    assert_eq!((log.matches("$ ").count(), log.matches("ALIKED_N16ROT").count()), (3, 1), "{log}");
+    // With SIFT asked for, none are tried.
+    let sift = "--overwrite --features sift --patience 0.1";
+    let (_, stderr) = run(&line(&photos, &out, &learned_stub(root, &cases), sift), 0);
+    assert!(!stderr.contains("learned"), "{stderr}");
+}
+
+#[test]
+fn a_colmap_without_learned_features_or_their_networks_is_told_with_the_remedy() {
+    let root = &Folder::empty();
+    let (photos, out) = (photographed(root), root.join("scene"));
+    let ask = |colmap: &Path| line(&photos, &out, colmap, "--features learned");
+    let parts = [
+        "--features learned: this COLMAP has no ALIKED features",
+        "--colmap PATH",
+        "--features sift",
+    ];
+    refused(&ask(&stub(root, &models(root))), 2, &parts);
+    assert!(!out.exists());
+    for (printed, parts) in [
+        (
+            "ALIKED feature extraction requires ONNX support.",
+            ["built without ONNX", "--features sift"],
+        ),
+        ("Check failed: Failed to download file", ["could not fetch", "n16rot_model_path=FILE"]),
+    ] {
+        let fails = format!("feature_extractor) echo '{printed}' >&2; exit 1;;");
+        refused(&ask(&learned_stub(root, &fails)), 2, &parts);
+    }
+    // What is tried without being asked for is a warning, and SIFT goes on.
+    model(4).write_binary(&root.join("few/0"));
+    model(9).write_binary(&root.join("all/0"));
+    let cases = format!(
+        "feature_extractor) case $database in */learned-*) echo 'requires ONNX support' >&2; exit 1;; esac;;\n\
+         mapper) case $database in */guided.db) cp -r {0}/all/* $output;; *) cp -r {0}/few/* $output;; esac;;",
+        root.display()
+    );
+    let (stdout, stderr) = run(&line(&photos, &out, &learned_stub(root, &cases), ""), 0);
+    assert!(stdout.contains("9 of 9 photographs"), "{stdout}");
+    for told in ["built without ONNX", "going on with SIFT", "4 of 9 have a camera: matching again"]
+    {
+        assert!(stderr.contains(told), "no `{told}` in: {stderr}");
     }
 }
 

@@ -44,29 +44,34 @@ pub struct MeasuredPhotograph {
     pub camera: Option<Camera>,
 }
 
-/// The number of pixels of a row over which light is averaged.
-const RUN: usize = 32;
+/// The largest share of values below black, where encoding cuts noise, that leaves the measurements right.
+const BELOW_BLACK: f64 = 0.1;
 
-/// The share of negative values from which on it is.
-const BELOW_BLACK: f64 = 0.02;
+/// The most pixels of a row over which light is averaged.
+const LONGEST_RUN: usize = 32;
 
-/// The planes to measure: where noise is so strong that it reaches below black, each value is the mean light of a run
-/// of pixels. Encoding is concave, so it takes off the mean of what is noisy; cutting at black adds to it.
+/// The planes to measure: each value is the mean light of the shortest run of pixels that leaves few values below
+/// black. Encoding is concave, so it takes off the mean of what is noisy; cutting at black adds to it.
 fn without_noise(planes: &[f32]) -> Cow<'_, [f32]> {
-    let negative = planes.iter().filter(|value| **value < 0.0).count();
-    if negative as f64 <= BELOW_BLACK * planes.len() as f64 {
-        return planes.into();
-    }
-    let averaged = |run: &[f32]| {
-        let light = run.iter().filter(|value| value.is_finite());
-        let sum: f64 = light.map(|value| f64::from(linear_from_srgb(*value))).sum();
-        vec![srgb_from_linear((sum / run.len() as f64) as f32); run.len()]
+    let is_noisy = |values: &[f32]| {
+        let negative = values.iter().filter(|value| **value < 0.0).count();
+        negative as f64 > BELOW_BLACK * values.len() as f64
     };
-    planes
-        .chunks(planes.len().div_ceil(3))
-        .flat_map(|plane| plane.chunks(RUN))
-        .flat_map(averaged)
-        .collect()
+    let mut averaged = Cow::Borrowed(planes);
+    let mut run = 2;
+    while run <= LONGEST_RUN && is_noisy(&averaged) {
+        let planes = planes.chunks(planes.len().div_ceil(3));
+        averaged = planes.flat_map(|plane| plane.chunks(run)).flat_map(mean_light).collect();
+        run *= 2;
+    }
+    averaged
+}
+
+/// The mean light of encoded values, for each of them; what is not finite counts as black.
+fn mean_light(values: &[f32]) -> impl Iterator<Item = f32> {
+    let finite = values.iter().filter(|value| value.is_finite());
+    let sum: f64 = finite.map(|value| f64::from(linear_from_srgb(*value))).sum();
+    std::iter::repeat_n(srgb_from_linear((sum / values.len() as f64) as f32), values.len())
 }
 
 impl MeasuredPhotograph {

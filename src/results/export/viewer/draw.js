@@ -210,8 +210,7 @@ function renderer(gl, changed) {
   // Shows another model: in the old order, where it has as many Gaussians, until it is sorted.
   function load(buffer) {
     model = opened(buffer);
-    // What changes as it trains is not fogged: a model that comes every second must be shown soon.
-    const data = geometry(model, scene.isLive ? null : coverage(scene.cameras, model.means, model.count));
+    const data = geometry(model, scene.showsCameras ? null : coverage(scene.cameras, model.means, model.count));
     geometryTexture(data);
     harmonicsTexture(harmonics(model));
     gl.useProgram(built);

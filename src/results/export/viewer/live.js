@@ -1,6 +1,8 @@
 // Follows a training: asks the page's server for progress, and for the model when it has changed.
 
 const ASK_EVERY = 1000;  // milliseconds
+// How long a page waits for the file that it asked a training to save.
+const SAVED_WITHIN = 60000;
 // The most views whose photographs an exported page has.
 const MOST_SHARED = 8;
 
@@ -70,10 +72,20 @@ async function sharedPage(source, buffer) {
   return within(within(source, 'scene', JSON.stringify(own).replaceAll('<', '\\u003c')), 'model', model);
 }
 
+// The file of the model: of a training under way, as it is now, in full.
+async function modelFile(state, order, wait) {
+  const { file: before, canControl } = state();
+  if (canControl) {
+    await order('save');
+    for (let waited = 0; waited < SAVED_WITHIN && state().file?.saved === before?.saved; waited += ASK_EVERY) await wait();
+  }
+  return { name: state().file.name, blob: await (await asked('file')).blob() };
+}
+
 // Shows every model that comes; returns once the first is shown.
 async function follow(show) {
   element('live').hidden = scene.showsCameras;
-  let version = 0, isPaused = false, hasEnded = false, buffer = null;
+  let version = 0, isPaused = false, hasEnded = false, buffer = null, latest = {};
   const source = await (await asked('')).text();
   const order = async (what) => { await fetch(`do/${what}`, { method: 'POST' }); await look(); };
   element('pause').addEventListener('click', () => order(isPaused ? 'resume' : 'pause'));
@@ -81,9 +93,20 @@ async function follow(show) {
   element('exportPage').addEventListener('click', async () => {
     download('model.html', new Blob([await sharedPage(source, buffer)], { type: 'text/html' }));
   });
+  element('exportModel').addEventListener('click', async () => {
+    const wait = () => new Promise((done) => setTimeout(done, ASK_EVERY)).then(look);
+    try {
+      const { name, blob } = await modelFile(() => latest, order, wait);
+      download(name, blob);
+    } catch (error) {
+      element('progress').textContent = `the model cannot be downloaded: ${error.message}`;
+    }
+  });
 
   async function look() {
     const state = await (await asked('state')).json();
+    latest = state;
+    element('exportModel').hidden = !state.file && !state.canControl;
     isPaused = state.phase === 'paused';
     hasEnded = Boolean(state.endedBy);
     element('progress').textContent = state.endedBy ?? summary(state);
@@ -105,7 +128,7 @@ async function follow(show) {
     } catch (error) {
       element('progress').textContent =
         'the program that serves this page has ended or cannot be reached; the last model is shown';
-      element('controls').hidden = true;
+      element('controls').hidden = element('exportModel').hidden = true;
     }
     if (!hasEnded) setTimeout(again, ASK_EVERY);
   }

@@ -3,7 +3,7 @@
 // A shared page hides its bar after so many seconds without a hand on it, in full screen and in the automatic flight.
 const IDLE_AFTER = 3000;  // milliseconds
 const HINTS = {
-  fine: 'Drag to turn · scroll to come nearer · W A S D to fly · double-click sets the centre',
+  fine: 'Drag to turn · scroll to come nearer · W A S D to fly · double-click sets the centre',
   coarse: 'One finger turns · two fingers move and come nearer · double-tap sets the centre',
 };
 
@@ -106,7 +106,7 @@ function start(gl) {
     compare.middle();
     for (const id of ['grey', 'lamp', 'difference']) element(id).checked = false;
     for (const id of ['layer', 'brightness', 'warmth']) {
-      element(id).value = '0';
+      element(id).value = linked(id);
       element(id).dispatchEvent(new Event('input'));
     }
     state.last = asked && views[asked[1]] ? Number(asked[1]) : 0;
@@ -152,6 +152,20 @@ function start(gl) {
   };
 }
 
+// The value of a slider in the address, which a link carries; 0: as trained.
+function linked(id) {
+  return new RegExp(`\\b${id}=(-?[\\d.]+)`).exec(location.hash)?.[1] ?? '0';
+}
+
+// Puts the sliders into the address.
+function link() {
+  const kept = location.hash.slice(1).split('&').filter((part) => part && !/^(brightness|warmth)=/.test(part));
+  const set = ['brightness', 'warmth'].filter((id) => Number(element(id).value));
+  const parts = [...kept, ...set.map((id) => `${id}=${element(id).value}`)].join('&');
+  // Without anything, the fragment goes as well.
+  history.replaceState(null, '', parts ? `#${parts}` : location.href.replace(/#.*$/, ''));
+}
+
 // Brightness in stops, and the colour of white; in the middle, the model as it was trained.
 function sliders(stage) {
   const inWords = {
@@ -166,7 +180,11 @@ function sliders(stage) {
       slider.title = `${slider.ariaLabel}: ${text}`;
       stage.refresh();
     });
-    slider.addEventListener('dblclick', () => { slider.value = 0; slider.dispatchEvent(new Event('input')); });
+    slider.addEventListener('change', link);
+    slider.addEventListener('dblclick', () => {
+      slider.value = 0;
+      for (const kind of ['input', 'change']) slider.dispatchEvent(new Event(kind));
+    });
   }
 }
 

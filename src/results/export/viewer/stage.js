@@ -35,7 +35,8 @@ function makeStage(gl) {
   const movers = [], painters = [];
   const reach = () => Math.max(distance(state.target, state.current.eye), 2 * scene.near);
   const isShared = () => root.dataset.face === 'share';
-  const isLimited = () => isShared() && !scene.isLive;
+  // Where photographs were taken is known from several of them, and where they lie is what one wants to see of poses.
+  const isLimited = () => isShared() && !scene.showsCameras && scene.cameras.length > 1;
 
   // A free camera fills the canvas with the view's angle, and has square pixels.
   const freed = () => {
