@@ -190,7 +190,7 @@ fn the_configuration_keeps_the_option() {
     let line = format!("train {} --out {}/run --explain", root.display(), root.display());
     let (explained, _) = run(&format!("{line} --orientation exif"), 0);
     let kept = explained.lines().find(|line| line.contains("orientation")).unwrap();
-    says(&kept, &["exif", "--orientation"]);
+    says(kept, &["exif", "--orientation"]);
     let (_, refused) = run(&format!("{line} --orientation upright"), 2);
     says(&refused, &["auto, stored, exif"]);
 }
