@@ -67,6 +67,44 @@ fn the_site_has_every_document() {
 }
 
 #[test]
+fn each_scene_of_the_gallery_has_its_commands_and_a_small_picture() {
+    const MAX_BYTES: u64 = 60_000;
+    let page = fs::read_to_string(Path::new(ROOT).join("docs/gallery.md")).unwrap();
+    let scenes = |start: &'static str| -> Vec<&str> {
+        page.split(start).skip(1).filter_map(|it| it.split([' ', '.', '\n', '-']).next()).collect()
+    };
+    let pictures = scenes("](gallery/");
+    assert_eq!(pictures.len(), 5);
+    for command in ["nightsplat synth ", "nightsplat train ", "nightsplat render "] {
+        assert_eq!(scenes(command), pictures, "{command}");
+    }
+    let folder = fs::read_dir(Path::new(ROOT).join("docs/gallery")).unwrap();
+    for path in folder.map(|entry| entry.unwrap().path()) {
+        let (name, bytes) = (path.file_stem().unwrap(), fs::metadata(&path).unwrap().len());
+        assert!(pictures.contains(&name.to_str().unwrap()), "{} is shown nowhere", path.display());
+        assert!(bytes <= MAX_BYTES, "{} has {bytes} bytes", path.display());
+    }
+}
+
+#[test]
+fn every_path_whose_instructions_are_counted_has_a_count() {
+    let read = |name| fs::read_to_string(Path::new(ROOT).join(name)).unwrap();
+    let (script, table) = (read("scripts/instructions.sh"), read("docs/instructions.csv"));
+    let paths: Vec<&str> =
+        script.split("\npath \"").skip(1).filter_map(|rest| rest.split('"').next()).collect();
+    assert_eq!(paths.len(), 5);
+    for line in table.lines().skip(1) {
+        let [_, _, path, count] = line.split(',').collect::<Vec<_>>()[..] else {
+            panic!("{line} has not commit, compiler, path and instructions")
+        };
+        assert!(paths.contains(&path) && count.parse::<u64>().unwrap() > 0, "{line}");
+    }
+    for path in paths {
+        assert!(table.contains(&format!(",{path},")), "docs/instructions.csv lacks {path}");
+    }
+}
+
+#[test]
 fn links_lead_to_files_and_headings_that_exist() {
     for (path, page) in documents() {
         let links = page.split("](").skip(1).filter_map(|rest| rest.split(')').next());
