@@ -2,7 +2,7 @@
 
 use nightsplat::splats::model::Model;
 
-use crate::common::command::{json, says};
+use crate::common::command::{json, says, unwrapped};
 use crate::common::prelude::*;
 
 /// The arguments for training with the default curve into `run`.
@@ -26,7 +26,7 @@ fn renders_are_written_and_scored_in_the_light_of_the_photographs() {
     assert!(aligned >= scored["mean"]["psnr"].as_f64().unwrap() - 0.01);
     let half = json(workspace.succeed("eval @run --downscale 1.5 --json"));
     assert_ne!(half["mean"]["psnr"], scored["mean"]["psnr"]);
-    let table = workspace.succeed("eval @run --photographs --align");
+    let table = unwrapped(&workspace.succeed("eval @run --photographs --align"));
     let raised = format!("by {slope:.2}: {:.2} dB of PSNR, dark", 20.0 * slope.log10());
     says(&table, &["PSNR, aligned", "PSNR, dark", "stops", &raised]);
     workspace.refused("eval @run --downscale 0.5", 2, &["is 0.5", "at least 1"]);
