@@ -9,7 +9,6 @@ use crate::gpu::{Buffer, Gpu, Recorder};
 
 /// Its kernels, with the packed weights of every layer.
 #[derive(Debug)]
-#[expect(clippy::large_enum_variant, reason = "there is one for each stage")]
 pub(super) enum Inner {
     Single(Conv),
     Half { conv: HalfConv, layers: Vec<PackedWeights> },

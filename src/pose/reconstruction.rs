@@ -273,7 +273,7 @@ impl<'a> Reconstruction<'a> {
         Ok(best.models)
     }
 
-    /// PoseFeatures, matches and cameras.
+    /// Features, matches and cameras.
     fn attempt(
         &mut self,
         pictures: &PosePhotographs,

@@ -10,6 +10,7 @@ use crate::splats::sort::{Count, RadixSort, TileSort, UnsortedTiles};
 
 /// The sort of the intersections by tile and depth.
 #[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "there is one for each renderer")]
 pub(super) enum Sort {
     /// All Gaussians by depth, then all intersections by tile.
     Whole { by_depth: RadixSort, by_tile: RadixSort },
