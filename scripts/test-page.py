@@ -318,7 +318,7 @@ def camera(browser):
     return found["position"] + found["rotation"]
 
 
-def moved(browser, since):
+def camera_after(browser, since):
     """Where the camera is when it moves on, within the time that a busy machine takes for a picture."""
     end = time.monotonic() + 20
     while (now := camera(browser)) == since and time.monotonic() < end:
@@ -533,8 +533,8 @@ def share(browser, page):
 
     begin = camera(browser)
     browser.evaluate("element('play').click()")
-    first = moved(browser, begin)
-    second = moved(browser, first)
+    first = camera_after(browser, begin)
+    second = camera_after(browser, first)
     playing = browser.evaluate("element('play').ariaPressed")
     hold(browser, "p")
     failed += report(playing == "true" and begin != first != second, "play moves the camera, and P ends it")
