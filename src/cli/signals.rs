@@ -30,7 +30,7 @@ pub(super) fn requests() -> Result<Requests> {
     let requests = Requests::default();
     let stops = stops();
     end_on_the_second(stops).map_err(refused)?;
-    // It comes every second from the soft limit of processor time on (`ulimit -St`), so it is no second signal.
+    // SIGXCPU comes every second from the soft limit of processor time on (`ulimit -St`), so it is no second signal.
     #[cfg(unix)]
     let out_of_time = [(signal_hook::consts::SIGXCPU, Stop::TimeUp)];
     #[cfg(not(unix))]
