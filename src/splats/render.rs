@@ -109,7 +109,7 @@ pub struct Renderer {
     blend_forward: Pipeline<blend_forward::Kernel>,
     /// With the depth as the last channel; built on first use.
     blend_depths: Option<Pipeline<blend_forward::Kernel>>,
-    /// Absent where the purpose is to show.
+    /// Built with the first backward pass.
     blend_backward: Option<Pipeline<blend_backward::Kernel>>,
     sort: Sort,
     frame: RenderBuffers,
@@ -289,7 +289,7 @@ impl Renderer {
     }
 
     /// Records the gradients of the Gaussians, given `d_render` (channels, H, W), the gradient of the last recorded
-    /// render, which must be of the same viewpoint.
+    /// render, which must be of the same viewpoint. The first of a camera model builds its kernels.
     ///
     /// # Errors
     /// The Gaussians are of another shape than the settings say, the renderer was made to show, or a pass exceeds what
@@ -308,6 +308,7 @@ impl Renderer {
         let view = self.view(&viewpoint.into(), false, DepthOrder::Own)?;
         let gaussians = gaussians.into();
         self.check(&gaussians.layout)?;
+        self.build_backward(view.kind)?;
         let project_backward = self.projections[&view.kind].backward.as_ref();
         let (Some(blend_backward), Some(project_backward)) =
             (&self.blend_backward, project_backward)

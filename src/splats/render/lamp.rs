@@ -21,7 +21,7 @@ pub(crate) struct DeviceLamp {
     /// The numbers that are bound while the light is even.
     even: Buffer<f32>,
     is_even: bool,
-    /// Absent where the purpose is to show.
+    /// Built with the first backward pass.
     backward: Option<LampBackward>,
 }
 
@@ -36,25 +36,31 @@ struct LampBackward {
 }
 
 impl DeviceLamp {
-    pub(super) fn new(
+    pub(super) fn new(gpu: &Gpu, purpose: Purpose, lamp: &Lamp) -> Result<Self> {
+        lamp.check()?;
+        let learned = if purpose == Purpose::Train { WIDTH } else { 0 };
+        Ok(Self {
+            numbers: gpu.buffer("lamp", &lamp.numbers())?,
+            gradients: gpu.zeros("lamp_gradients", learned)?,
+            even: gpu.buffer("even_light", &lamp.even_numbers())?,
+            is_even: false,
+            backward: None,
+        })
+    }
+
+    /// Builds the kernels of the backward pass unless they are there; whether it did.
+    pub(super) fn build_backward(
+        &mut self,
         gpu: &Gpu,
         settings: &RenderSettings,
         tile: Tile,
         frozen_columns: u32,
-        lamp: &Lamp,
-    ) -> Result<Self> {
-        lamp.check()?;
-        let backward = match settings.purpose {
-            Purpose::Show => None,
-            Purpose::Train => Some(LampBackward::new(gpu, settings, tile, frozen_columns)?),
-        };
-        Ok(Self {
-            numbers: gpu.buffer("lamp", &lamp.numbers())?,
-            gradients: gpu.zeros("lamp_gradients", if backward.is_some() { WIDTH } else { 0 })?,
-            even: gpu.buffer("even_light", &lamp.even_numbers())?,
-            is_even: false,
-            backward,
-        })
+    ) -> Result<bool> {
+        let is_new = self.backward.is_none();
+        if is_new {
+            self.backward = Some(LampBackward::new(gpu, settings, tile, frozen_columns)?);
+        }
+        Ok(is_new)
     }
 }
 

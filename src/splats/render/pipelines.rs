@@ -1,4 +1,5 @@
-//! The kernels of a renderer: those that every view needs at once, others on first use.
+//! The kernels of a renderer: those that every view needs at once, others on first use. A program that only draws is
+//! linked without those of the backward pass.
 
 use std::collections::BTreeMap;
 
@@ -26,10 +27,13 @@ impl Renderer {
     /// # Errors
     /// The driver refuses a kernel, or the tile does not suit the device.
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
-        Self::with_gradients(gpu, settings, GradientKind::All, 0)
+        let tile = settings.tile_on(gpu)?;
+        let segment = segment_length(gpu.properties(), settings.purpose, tile);
+        Self::build(gpu, settings, WrittenGradients::ALL, tile, segment)
     }
 
-    /// [`Renderer::new`] whose backward pass writes such gradients, but not those of the first `frozen_columns`.
+    /// [`Renderer::new`] with the kernels of its backward pass, which writes such gradients, but not those of the first
+    /// `frozen_columns`.
     #[doc(hidden)]
     pub fn with_gradients(
         gpu: &Gpu,
@@ -40,14 +44,15 @@ impl Renderer {
         let tile = settings.tile_on(gpu)?;
         let segment = segment_length(gpu.properties(), settings.purpose, tile);
         let gradients = WrittenGradients { kind: gradients, frozen_columns };
-        Self::build(gpu, settings, gradients, tile, segment)
+        let mut renderer = Self::build(gpu, settings, gradients, tile, segment)?;
+        renderer.build_backward(ProjectionKind::pinhole())?;
+        Ok(renderer)
     }
 
     /// [`Renderer::new`] with segments of `segment` splats, a multiple of the subgroup size; 0: a run has one segment.
     #[doc(hidden)]
     pub fn with_segments(gpu: &Gpu, settings: RenderSettings, segment: u32) -> Result<Self> {
-        let gradients = WrittenGradients { kind: GradientKind::All, frozen_columns: 0 };
-        Self::build(gpu, settings, gradients, settings.tile_on(gpu)?, segment)
+        Self::build(gpu, settings, WrittenGradients::ALL, settings.tile_on(gpu)?, segment)
     }
 
     fn build(
@@ -57,36 +62,12 @@ impl Renderer {
         tile: Tile,
         segment: u32,
     ) -> Result<Self> {
-        let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
+        let [tile_width, tile_height] = tile.size;
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
-        let pinhole = ProjectionKind {
-            camera_model: model_number(&CameraModel::Pinhole),
-            view_depths: false,
-            instances: None,
-            shares_sort: false,
-        };
-        let frozen_columns = gradients.frozen_columns;
-        let lamp = settings.lamp;
-        let lamp = lamp.map(|lamp| DeviceLamp::new(gpu, &settings, tile, frozen_columns, &lamp));
-        let projections = Projections::new(gpu, &settings, tile.size, pinhole, gradients)?;
-        let shaping_channels = settings.shaping_channels();
-        let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
-        let blend_backward = match settings.purpose {
-            Purpose::Show => None,
-            Purpose::Train => Some(gpu.pipeline(&blend_backward::Constants {
-                alpha_max,
-                channels,
-                tile_width,
-                tile_height,
-                shaping_channels,
-                skips_groups,
-                splats_per_turn,
-                sums_in_shared_memory: sums_in_shared_memory(gpu.properties()),
-                subgroups_per_tile,
-                segment,
-            })?),
-        };
+        let pinhole = ProjectionKind::pinhole();
+        let lamp = settings.lamp.map(|lamp| DeviceLamp::new(gpu, settings.purpose, &lamp));
+        let projections = Projections::new(gpu, &settings, tile, pinhole)?;
         let state = tile_width * tile_height * (channels + 1);
         let segments = Segments { length: segment, state };
         let sorting = settings.sorting_on(gpu);
@@ -108,7 +89,7 @@ impl Renderer {
             })?,
             blend_forward: blending(gpu, &settings, tile, segment, false)?,
             blend_depths: None,
-            blend_backward,
+            blend_backward: None,
             sort: Sort::new(gpu, sorting)?,
             frame: RenderBuffers::new(gpu, settings.channels(), settings.purpose, segments)?,
             limits: gpu.uninit("limits", 1)?,
@@ -123,9 +104,30 @@ impl Renderer {
     /// Builds the kernels for a camera model where they are not there yet.
     pub(super) fn build_projections(&mut self, kind: ProjectionKind) -> Result<()> {
         if !self.projections.contains_key(&kind) {
-            let Self { gpu, settings, tile, gradients, .. } = self;
-            let projections = Projections::new(gpu, settings, tile.size, kind, *gradients)?;
+            let projections = Projections::new(&self.gpu, &self.settings, self.tile, kind)?;
             self.projections.insert(kind, projections);
+        }
+        Ok(())
+    }
+
+    /// Builds the kernels of the backward pass where such views have one and its kernels are not there yet.
+    pub(super) fn build_backward(&mut self, kind: ProjectionKind) -> Result<()> {
+        let Self { gpu, settings, gradients, tile, .. } = self;
+        if settings.purpose == Purpose::Show || kind.camera_model == CAMERA_ORTHOGRAPHIC {
+            return Ok(());
+        }
+        if self.blend_backward.is_none() {
+            let segment = self.frame.segments.length;
+            self.blend_backward = Some(blending_backward(gpu, settings, *tile, segment)?);
+        }
+        if let Some(Projections { backward: backward @ None, .. }) = self.projections.get_mut(&kind)
+        {
+            *backward = Some(projection_backward(gpu, settings, *tile, kind, *gradients)?);
+        }
+        if let Some(lamp) = &mut self.lamp
+            && lamp.build_backward(gpu, settings, *tile, gradients.frozen_columns)?
+        {
+            self.reserve_lamp()?;
         }
         Ok(())
     }
@@ -142,14 +144,13 @@ impl Renderer {
     #[doc(hidden)]
     pub fn set_lamp(&mut self, lamp: Option<Lamp>) -> Result<()> {
         let settings = RenderSettings { lamp, ..self.settings };
-        let frozen_columns = self.gradients.frozen_columns;
-        let new = |lamp| DeviceLamp::new(&self.gpu, &settings, self.tile, frozen_columns, &lamp);
+        let new = |lamp| DeviceLamp::new(&self.gpu, settings.purpose, &lamp);
         let on_device = lamp.map(new).transpose()?;
         if lamp.is_some() != self.settings.lamp.is_some() {
             self.projections = self.built_with(&settings)?;
         }
         (self.settings, self.lamp) = (settings, on_device);
-        self.reserve_lamp()
+        Ok(())
     }
 
     /// The kernels that read Gaussians, for other settings.
@@ -157,9 +158,8 @@ impl Renderer {
         &self,
         settings: &RenderSettings,
     ) -> Result<BTreeMap<ProjectionKind, Projections>> {
-        let Self { gpu, tile, gradients, .. } = self;
         let built = |&kind: &ProjectionKind| {
-            Ok((kind, Projections::new(gpu, settings, tile.size, kind, *gradients)?))
+            Ok((kind, Projections::new(&self.gpu, settings, self.tile, kind)?))
         };
         self.projections.keys().map(built).collect()
     }
@@ -194,6 +194,14 @@ pub(super) struct ProjectionKind {
     pub(super) shares_sort: bool,
 }
 
+impl ProjectionKind {
+    /// Of a pinhole camera and a model without transform.
+    fn pinhole() -> Self {
+        let camera_model = model_number(&CameraModel::Pinhole);
+        Self { camera_model, view_depths: false, instances: None, shares_sort: false }
+    }
+}
+
 /// The gradients that the backward pass writes.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct WrittenGradients {
@@ -202,59 +210,62 @@ pub(super) struct WrittenGradients {
     pub(super) frozen_columns: u32,
 }
 
+impl WrittenGradients {
+    const ALL: Self = Self { kind: GradientKind::All, frozen_columns: 0 };
+}
+
 /// The kernels that read Gaussians and cameras, the only ones that depend on the SH degree and the camera model.
 #[derive(Debug)]
 pub(super) struct Projections {
     pub(super) forward: Pipeline<project::Kernel>,
-    /// Absent where the purpose is to show, of an orthographic camera, and with depths.
+    /// Built with the first backward pass.
     pub(super) backward: Option<Pipeline<project_backward::Kernel>>,
 }
 
+/// Builds a kernel that projects views, given its other constants.
+macro_rules! projection {
+    ($kernel:ident, $gpu:expr, $settings:expr, $tile:expr, $kind:expr, { $($extra:ident: $value:expr),* }) => {{
+        let (gpu, settings, kind): (&Gpu, &RenderSettings, ProjectionKind) = ($gpu, $settings, $kind);
+        let (sh_degree, rest) = kind.instances.unwrap_or((settings.shape.sh_degree, settings.rest));
+        gpu.pipeline(&$kernel::Constants {
+            channels: settings.channels() as u32 + u32::from(kind.view_depths),
+            alpha_max: settings.max_alpha,
+            tile_width: $tile.size[0],
+            tile_height: $tile.size[1],
+            sh_degree,
+            raw_colors: settings.raw_colors,
+            antialiased: settings.antialiased,
+            lamp: settings.lamp.is_some(),
+            half_rest: rest == StorageFormat::Half,
+            rest_by_column: rest_by_column(gpu),
+            camera_model: kind.camera_model,
+            $($extra: $value,)*
+        })
+    }};
+}
+
 impl Projections {
-    fn new(
-        gpu: &Gpu,
-        settings: &RenderSettings,
-        [tile_width, tile_height]: [u32; 2],
-        ProjectionKind { camera_model, view_depths: has_depths, instances, shares_sort }: ProjectionKind,
-        WrittenGradients { kind, frozen_columns }: WrittenGradients,
-    ) -> Result<Self> {
-        let color_gradients = kind == GradientKind::Colors;
-        let (view_depths, alpha_max) = (u32::from(has_depths), settings.max_alpha);
-        let channels = settings.channels() as u32 + view_depths;
-        let RenderSettings { raw_colors, antialiased, .. } = *settings;
-        let (sh_degree, rest) = instances.unwrap_or((settings.shape.sh_degree, settings.rest));
-        let (lamp, is_instanced) = (settings.lamp.is_some(), instances.is_some());
-        let half_rest = rest == StorageFormat::Half;
-        let rest_by_column = rest_by_column(gpu);
-        macro_rules! pipeline {
-            ($kernel:ident $(, $extra:ident)*) => {
-                gpu.pipeline(&$kernel::Constants {
-                    channels,
-                    alpha_max,
-                    tile_width,
-                    tile_height,
-                    sh_degree,
-                    raw_colors,
-                    antialiased,
-                    lamp,
-                    half_rest,
-                    rest_by_column,
-                    camera_model,
-                    $($extra,)*
-                })?
-            };
-        }
-        let is_shown = has_depths || is_instanced || shares_sort;
-        let is_trained_on = camera_model != CAMERA_ORTHOGRAPHIC && !is_shown;
-        let has_gradients = settings.purpose == Purpose::Train && is_trained_on;
-        let backward = if has_gradients {
-            Some(pipeline!(project_backward, color_gradients, frozen_columns))
-        } else {
-            None
-        };
-        let instances = is_instanced;
-        Ok(Self { forward: pipeline!(project, view_depths, instances, shares_sort), backward })
+    fn new(gpu: &Gpu, settings: &RenderSettings, tile: Tile, kind: ProjectionKind) -> Result<Self> {
+        let forward = projection!(project, gpu, settings, tile, kind, {
+            view_depths: u32::from(kind.view_depths),
+            instances: kind.instances.is_some(),
+            shares_sort: kind.shares_sort
+        });
+        Ok(Self { forward: forward?, backward: None })
     }
+}
+
+fn projection_backward(
+    gpu: &Gpu,
+    settings: &RenderSettings,
+    tile: Tile,
+    kind: ProjectionKind,
+    WrittenGradients { kind: written, frozen_columns }: WrittenGradients,
+) -> Result<Pipeline<project_backward::Kernel>> {
+    projection!(project_backward, gpu, settings, tile, kind, {
+        color_gradients: written == GradientKind::Colors,
+        frozen_columns: frozen_columns
+    })
 }
 
 /// The blending kernel, with or without the depth as the last channel.
@@ -275,6 +286,26 @@ fn blending(
         splats_per_turn: splats_per_turn(gpu),
         subgroups_per_tile,
         view_depths,
+        segment,
+    })
+}
+
+fn blending_backward(
+    gpu: &Gpu,
+    settings: &RenderSettings,
+    Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile }: Tile,
+    segment: u32,
+) -> Result<Pipeline<blend_backward::Kernel>> {
+    gpu.pipeline(&blend_backward::Constants {
+        alpha_max: settings.max_alpha,
+        channels: settings.channels() as u32,
+        tile_width,
+        tile_height,
+        shaping_channels: settings.shaping_channels(),
+        skips_groups: !gpu.properties().is_cpu,
+        splats_per_turn: splats_per_turn(gpu),
+        sums_in_shared_memory: sums_in_shared_memory(gpu.properties()),
+        subgroups_per_tile,
         segment,
     })
 }
