@@ -233,6 +233,7 @@ fn posed(
         Error::input(&options.photos, problem)
     })?;
     let lenses = possible_lenses(&model, &options.photos)?;
+    let unsupported = cameras::unsupported(&Dataset::points_seen(&model)?);
     let bright: Vec<String> = names.iter().filter_map(|name| bright_name(name)).collect();
     let dark: Vec<String> = names.into_iter().filter(|name| is_dark(name)).collect();
     out.add_photographs("", &pictures.dark, &dark)?;
@@ -250,6 +251,7 @@ fn posed(
     let target = options.out.display();
     report(PoseProgress::Line(&format!("{placed} of {all} photographs have a camera -> {target}")));
     warn_of(&lenses, &pictures.dark, &dark);
+    unsupported.iter().for_each(|warning| tracing::warn!("{warning}"));
     let bright = options.with.as_ref().map(|_| [bright.len(), pictures.bright.len()]);
     Ok(Posed { photographs: all, placed, bright, lenses })
 }

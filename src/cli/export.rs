@@ -49,7 +49,7 @@ pub struct ExportArgs {
     #[arg(long, value_name = "N", default_value_t = Division::default().chunk)]
     pub chunk: usize,
     /// The largest file, such as 8M: coefficients of colours are left out, then levels of detail, until it fits; in
-    /// html, photographs shrink. Not for ply and streamed-sog
+    /// html, photographs shrink, and coefficients are rounded first. Not for ply and streamed-sog
     #[arg(long, value_name = "SIZE")]
     pub max_size: Option<CacheSize>,
     /// For html: number of views to start from, with photographs

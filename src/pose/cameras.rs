@@ -86,10 +86,52 @@ pub(super) fn implausible(lens: &Lens) -> Option<String> {
     })
 }
 
+/// Names photographs whose cameras rest on few points, of photographs with how many points they see; `None` without
+/// any. In dark photographs, a third of what half of the others see is what chance matches reach: such cameras are
+/// often of another pose altogether.
+pub(super) fn unsupported(seen: &[(String, usize)]) -> Option<String> {
+    /// The share of the median, and a number of points that holds any camera.
+    const SHARE: f64 = 1.0 / 3.0;
+    const ENOUGH: usize = 60;
+    const NAMED: usize = 5;
+    let mut counts: Vec<usize> = seen.iter().map(|(_, count)| *count).collect();
+    counts.sort_unstable();
+    let median = *counts.get(counts.len() / 2)?;
+    let is_few = |count: usize| count < ENOUGH && (count as f64) < SHARE * median as f64;
+    let few: Vec<String> = seen
+        .iter()
+        .filter(|(_, count)| is_few(*count))
+        .map(|(name, count)| format!("{name} ({count})"))
+        .collect();
+    let (first, more) = (few[..few.len().min(NAMED)].join(", "), few.len().saturating_sub(NAMED));
+    let named = if more > 0 { format!("{first} and {more} more") } else { first };
+    (!few.is_empty()).then(|| {
+        format!(
+            "few points hold these cameras, which may be wrong: {named}; half of all photographs see {median}. Look at \
+             them with `nightsplat view`, and leave wrong ones out with `train --exclude NAME`"
+        )
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use nightsplat_core::camera::Distortion;
+
+    #[test]
+    fn cameras_that_rest_on_few_points_are_named() {
+        let seen = |counts: &[usize]| -> Vec<(String, usize)> {
+            counts.iter().enumerate().map(|(i, &count)| (format!("{i}.png"), count)).collect()
+        };
+        let warning = unsupported(&seen(&[33, 75, 83, 112, 130, 193])).unwrap();
+        assert!(
+            warning.contains(": 0.png (33); half") && warning.contains("see 112."),
+            "{warning}"
+        );
+        for counts in [&[75, 83, 112, 130][..], &[20, 25, 30, 35], &[61, 300, 400, 500], &[]] {
+            assert_eq!(unsupported(&seen(counts)), None, "{counts:?}");
+        }
+    }
 
     #[test]
     fn a_real_calibration_passes_and_a_mixture_of_two_lenses_does_not() {

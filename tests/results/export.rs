@@ -2,7 +2,9 @@
 
 use std::path::Path;
 
-use nightsplat::splats::scene::ply;
+use nightsplat::glam::Vec3;
+use nightsplat::splats::scene::{Gaussians, ply};
+use nightsplat_core::random::Stream;
 
 use crate::common::command::{Folder, json, says};
 
@@ -47,6 +49,34 @@ fn every_format_is_one_file_of_the_run_with_its_expected_beginning() {
 
     folder.succeed("export @run --format spz --spz 3 --out @v3.spz");
     assert!(folder.read("v3.spz").starts_with(&[0x1f, 0x8b]));
+}
+
+#[test]
+fn a_page_of_limited_size_rounds_coefficients_before_it_leaves_them_out() {
+    let folder = trained();
+    let stream = Stream::new(3, 0);
+    let gaussians = ply::load(folder.path("run/model.ply")).unwrap();
+    let mut gaussians = Gaussians::concatenated(&[&gaussians; 10]).with_sh_degree(3);
+    for (i, rest) in gaussians.rest_mut().iter_mut().enumerate() {
+        *rest = Vec3::splat(0.05 * stream.uniform(i as u64) as f32);
+    }
+    ply::save(&gaussians, folder.path("run/model.ply")).unwrap();
+    let mut sizes = vec![];
+    let mut exported = |most: u64| {
+        let line =
+            folder.succeed(&format!("export @run --format html --views 1 --max-size {most}B"));
+        sizes.push(std::fs::metadata(folder.path("run/model.html")).unwrap().len());
+        (line, *sizes.last().unwrap())
+    };
+    let (line, whole) = exported(1 << 30);
+    says(&line, &["SH degree 3 of 3, level 0"]);
+    let (line, rounded) = exported(whole - 1);
+    says(&line, &["SH degree 3 of 3 in multiples of 1/256, level 0"]);
+    let (line, coarse) = exported(rounded - 1);
+    says(&line, &["SH degree 3 of 3 in multiples of 1/64, level 0"]);
+    let (line, _) = exported(coarse - 1);
+    says(&line, &["SH degree 2 of 3", "level 0"]);
+    assert!(sizes.is_sorted_by(|one, next| next < one), "{sizes:?}");
 }
 
 /// Positions in a GLB, which come first.

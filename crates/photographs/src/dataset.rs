@@ -42,7 +42,7 @@ mod undistort;
 mod unused;
 mod view;
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
@@ -246,6 +246,20 @@ impl Dataset {
         let taken = |id| images.iter().filter(|image| image.camera == id).count();
         let lenses = colmap::read_cameras(model)?;
         Ok(lenses.into_iter().map(|(id, lens)| (lens, taken(id))).collect())
+    }
+
+    /// The photographs of a COLMAP model, each with how many points it sees.
+    #[doc(hidden)]
+    pub fn points_seen(model: &Path) -> Result<Vec<(String, usize)>> {
+        let mut seen = BTreeMap::<u32, usize>::new();
+        let points = colmap::read_points(model)?;
+        points
+            .iter()
+            .flat_map(|point| &point.images)
+            .for_each(|&id| *seen.entry(id).or_default() += 1);
+        let of = |id| seen.get(&id).copied().unwrap_or_default();
+        let images = colmap::read_images(model)?;
+        Ok(images.into_iter().map(|image| (image.name, of(image.id))).collect())
     }
 
     /// The folder with the contents of an archive: its only folder, if there is nothing else.
