@@ -80,6 +80,11 @@ pub const REQUIREMENTS: &[Requirement] = &[
         supported: |o| o.features.subgroup_size_control.compute_full_subgroups == vk::TRUE,
     },
     Requirement {
+        name: "an instance of Vulkan 1.1 (VkApplicationInfo::apiVersion)",
+        why: "an older one does not tell what subgroups can do: every device of Vulkan 1.1 has basic operations",
+        supported: |o| o.subgroup_operations.contains(vk::SubgroupFeatureFlags::BASIC),
+    },
+    Requirement {
         name: "subgroup operations basic, vote, arithmetic, ballot, shuffle in compute",
         why: "blending and sorting without barriers",
         supported: |o| {
@@ -184,6 +189,9 @@ mod tests {
             }),
             ("computeFullSubgroups", |o| {
                 o.features.subgroup_size_control.compute_full_subgroups = vk::FALSE;
+            }),
+            ("an instance of Vulkan 1.1", |o| {
+                o.subgroup_operations = vk::SubgroupFeatureFlags::empty()
             }),
             ("subgroup operations", |o| o.subgroup_operations = vk::SubgroupFeatureFlags::BASIC),
             ("subgroup size", |o| o.subgroups.default = 2),

@@ -7,7 +7,7 @@ use nightsplat_core::camera::{Camera, CameraModel, Patch, deviation_from_rigid};
 use nightsplat_core::curves::SceneLaw;
 
 use super::eyes::check_axes;
-use crate::gpu::{HostImage, ImageFormat};
+use crate::gpu::{HostImage, ImageFormat, ImageState};
 use crate::kernels::pixels::{
     DEPTH_16, DEPTH_24, DEPTH_FLOAT, LIGHT_DISPLAY, LIGHT_HDR10, LIGHT_LINEAR, LIGHT_SRGB,
     STORED_BYTES, STORED_FLOATS, STORED_HALVES, STORED_SMALL_FLOATS, STORED_TENS,
@@ -302,6 +302,9 @@ fn check_image(
         let (format, list) = (image.format, names(formats));
         return refused(format!("the {name} image has format {format:?}; take one of {list}"));
     }
+    if image.after.layout == ImageState::UNDEFINED.layout {
+        return refused(format!("the {name} image has no layout after the render; state one"));
+    }
     let [width, height] = image.size;
     match cameras.iter().find(|camera| camera.width > width || camera.height > height) {
         Some(camera) => refused(format!(
@@ -326,8 +329,9 @@ fn check_camera(index: usize, camera: &Camera) -> Result<()> {
         return refused(format!("camera {index} is {width}x{height}; it needs at least one pixel"));
     }
     if !(focal.is_finite() && focal.min_element() > 0.0 && focal.max_element() <= MOST_PIXELS) {
+        let focal = focal.to_array();
         return refused(format!(
-            "camera {index} has focal length {focal}; it is positive and at most {MOST_PIXELS:e}"
+            "camera {index} has focal length {focal:?}; it is positive and at most {MOST_PIXELS:e}"
         ));
     }
     let is_near = principal_point.abs().max_element() <= MOST_PIXELS

@@ -280,12 +280,13 @@ static void renders(void)
     DRAW("is null", (other.image = VK_NULL_HANDLE, drawn.color = &other));
     DRAW("format", (other.format = VK_FORMAT_R8_UNORM, drawn.color = &other));
     DRAW("is_owned", (other.after.is_owned = 2, drawn.color = &other));
+    DRAW("no layout after", (other.after.layout = VK_IMAGE_LAYOUT_UNDEFINED, drawn.color = &other));
     DRAW("smaller than", (other.extent.width = 63, drawn.color = &other));
     DRAW("NspCamera::struct_size", (moved.struct_size = 0, drawn.cameras = &moved));
     DRAW("camera 0 has unknown flags", (moved.flags = 8, drawn.cameras = &moved));
     DRAW("0x64", (moved.width = 0, drawn.cameras = &moved));
     DRAW("focal length", (moved.focal[0] = NAN, drawn.cameras = &moved));
-    DRAW("focal length", (moved.focal[0] = 1e300, drawn.cameras = &moved));
+    DRAW("focal length [1e300, ", (moved.focal[0] = 1e300, drawn.cameras = &moved));
     DRAW("not finite", (moved.principal_point[0] = 1e30, drawn.cameras = &moved));
     DRAW("not finite", (moved.view_from_world[3] = 1e30, drawn.cameras = &moved));
     DRAW("not rigid", (moved.view_from_world[0] = 2, drawn.cameras = &moved));
