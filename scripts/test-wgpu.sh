@@ -1,8 +1,10 @@
 #!/usr/bin/env bash
 # Builds examples/wgpu, and has wgpu's own device draw a model under the validation layer: without a message, and the
-# library's own picture to a level.
+# library's own picture to a level. With the argument bevy, or once a week, Bevy's device as well (examples/bevy, whose
+# 300 crates take minutes).
 set -euo pipefail
 cd "$(dirname "$0")/../examples/wgpu"
+with_bevy=${NIGHTSPLAT_WEEKLY:-${1:-}}
 
 export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$PWD/../../target}
 # Its lints check every crate below it once more: once a week.
@@ -26,10 +28,20 @@ awk 'BEGIN {
 }' > "$folder/model.ply"
 export VK_INSTANCE_LAYERS=VK_LAYER_KHRONOS_validation
 export VK_LAYER_ENABLES=VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT
-for wall in "" 4; do
-    printed=$("$CARGO_TARGET_DIR/debug/wgpu-host" "$folder/model.ply" "$folder/out.ppm" $wall 2>&1) ||
+# draws NAME PROGRAM [ARGUMENT..]: the program draws the model.
+draws() {
+    local name=$1 program=$2 printed
+    shift 2
+    printed=$("$CARGO_TARGET_DIR/debug/$program" "$folder/model.ply" "$folder/out.ppm" "$@" 2>&1) ||
         { echo "$printed" >&2 && exit 1; }
-    echo "wall ${wall:-none}: $printed"
+    echo "$name: $printed"
     ! grep -q 'Validation\|VUID' <<< "$printed" || { echo "a message of the validation layer" >&2; exit 1; }
     grep -q '^largest difference [01]$' <<< "$printed" || { echo "another picture" >&2; exit 1; }
-done
+}
+draws wgpu wgpu-host
+draws "wgpu with a wall" wgpu-host 4
+if [ -n "$with_bevy" ]; then
+    # Some of Bevy's crates state a newer compiler than they need.
+    (cd ../bevy && cargo build --locked --ignore-rust-version)
+    draws Bevy bevy-host
+fi
