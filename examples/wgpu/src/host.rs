@@ -1,5 +1,5 @@
 //! What any wgpu application has: device, textures, a pass of its own. Its lines that are there for the library are
-//! `open`, `lend`, `images`, and the second encoder of a frame.
+//! `enable`, `open`, `lend`, `images`, and the second encoder of a frame.
 
 use std::error::Error;
 use std::ffi::{CStr, c_void};
@@ -9,10 +9,12 @@ use nightsplat::ash::{self, khr};
 use nightsplat::{
     FeatureStructs, HostDevice, HostFrame, HostImage, ImageFormat, ImageState, require_features,
 };
-use wgpu_hal::vulkan::Api as Vulkan;
+use wgpu_hal::vulkan::{Api as Vulkan, CreateDeviceCallbackArgs};
 
-pub(crate) const SIZE: [u32; 2] = [320, 240];
-pub(crate) const NEAR: f32 = 0.1;
+/// Width and height of the picture.
+pub const SIZE: [u32; 2] = [320, 240];
+/// The near plane of the host's depth.
+pub const NEAR: f32 = 0.1;
 
 const SHADER: &str = "
 @vertex fn corner(@builtin(vertex_index) i: u32) -> @builtin(position) vec4f {
@@ -21,7 +23,8 @@ const SHADER: &str = "
 }
 @fragment fn color() -> @location(0) vec4f { return vec4f(0.2, 0.6, 0.2, 1); }";
 
-pub(crate) struct Host {
+/// Textures on a device of wgpu.
+pub struct Host {
     device: wgpu::Device,
     queue: wgpu::Queue,
     color: wgpu::Texture,
@@ -31,30 +34,39 @@ pub(crate) struct Host {
     frames: vk::Semaphore,
 }
 
+/// With it wgpu chains the struct of subgroup size control, as it chains that of timeline semaphores anyway.
+pub const FEATURES: wgpu::Features = wgpu::Features::SUBGROUP;
+
+/// Enables what the library needs on a device that wgpu is about to open with [`FEATURES`].
+///
+/// # Safety
+/// The structs outlive the call that creates the device.
+pub unsafe fn enable(arguments: &mut CreateDeviceCallbackArgs, structs: &mut FeatureStructs) {
+    let chained_by_wgpu = [
+        vk::PhysicalDeviceTimelineSemaphoreFeatures::STRUCTURE_TYPE.as_raw(),
+        vk::PhysicalDeviceSubgroupSizeControlFeatures::STRUCTURE_TYPE.as_raw(),
+    ];
+    arguments.extensions.push(khr::push_descriptor::NAME);
+    let chain: *mut vk::DeviceCreateInfo<'_> = arguments.create_info;
+    // SAFETY: the chain is valid, and the structs live as long as it does.
+    unsafe { require_features(chain.cast(), structs, &chained_by_wgpu) };
+}
+
 /// Opens a device as wgpu does, and enables what the library needs in wgpu's callback.
 fn open(adapter: &wgpu::Adapter) -> Result<(wgpu::Device, wgpu::Queue), Box<dyn Error>> {
-    // With it wgpu chains the struct of subgroup size control, as it chains that of timeline semaphores anyway.
-    let features = wgpu::Features::SUBGROUP;
     let limits = wgpu::Limits::default();
     let mut structs = FeatureStructs::default();
     // SAFETY: the structs outlive the call that creates the device.
     let opened = unsafe {
         let hal = adapter.as_hal::<Vulkan>().ok_or("wgpu has no Vulkan here")?;
-        let chained_by_wgpu = [
-            vk::PhysicalDeviceTimelineSemaphoreFeatures::STRUCTURE_TYPE.as_raw(),
-            vk::PhysicalDeviceSubgroupSizeControlFeatures::STRUCTURE_TYPE.as_raw(),
-        ];
-        let callback = |arguments: wgpu_hal::vulkan::CreateDeviceCallbackArgs<'_, '_, '_>| {
-            arguments.extensions.push(khr::push_descriptor::NAME);
-            let chain: *mut vk::DeviceCreateInfo<'_> = arguments.create_info;
-            require_features(chain.cast(), &mut structs, &chained_by_wgpu);
+        let callback = |mut arguments: CreateDeviceCallbackArgs<'_, '_, '_>| {
+            enable(&mut arguments, &mut structs)
         };
         let hints = wgpu::MemoryHints::default();
-        hal.open_with_callback(features, &limits, &hints, Some(Box::new(callback)))?
+        hal.open_with_callback(FEATURES, &limits, &hints, Some(Box::new(callback)))?
     };
-    let required_features = features;
     let descriptor = wgpu::DeviceDescriptor {
-        required_features,
+        required_features: FEATURES,
         required_limits: limits,
         ..Default::default()
     };
@@ -63,13 +75,19 @@ fn open(adapter: &wgpu::Adapter) -> Result<(wgpu::Device, wgpu::Queue), Box<dyn 
 }
 
 impl Host {
-    pub(crate) fn new() -> Result<Self, Box<dyn Error>> {
+    /// On the first Vulkan device, opened as wgpu opens it.
+    pub fn new() -> Result<Self, Box<dyn Error>> {
         let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
         descriptor.backends = wgpu::Backends::VULKAN;
         let instance = wgpu::Instance::new(descriptor);
         let adapters = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::VULKAN));
         let adapter = adapters.into_iter().next().ok_or("no Vulkan device")?;
         let (device, queue) = open(&adapter)?;
+        Self::on(device, queue)
+    }
+
+    /// On a device for which [`enable`] was called.
+    pub fn on(device: wgpu::Device, queue: wgpu::Queue) -> Result<Self, Box<dyn Error>> {
         let size = wgpu::Extent3d { width: SIZE[0], height: SIZE[1], depth_or_array_layers: 1 };
         let texture = |format, copied| {
             device.create_texture(&wgpu::TextureDescriptor {
@@ -103,7 +121,7 @@ impl Host {
     }
 
     /// The device as the library takes it. It records and never submits, so it needs no queue.
-    pub(crate) fn lend(&self) -> HostDevice<'static> {
+    pub fn lend(&self) -> HostDevice<'static> {
         const EXTENSIONS: &[&CStr] = &[khr::push_descriptor::NAME];
         // SAFETY: the handles are only copied.
         let hal = unsafe { self.device.as_hal::<Vulkan>() };
@@ -124,7 +142,7 @@ impl Host {
     }
 
     /// Colour and depth, as a frame lends them: in the states that `transition_resources` puts them in.
-    pub(crate) fn images(&self) -> (HostImage, HostImage) {
+    pub fn images(&self) -> (HostImage, HostImage) {
         let image = |texture: &wgpu::Texture, format, state| {
             // SAFETY: the handle is only copied.
             let hal = unsafe { texture.as_hal::<Vulkan>() };
@@ -140,7 +158,7 @@ impl Host {
     }
 
     /// Draws the wall, has `record` draw over it, and reads the picture.
-    pub(crate) fn frame(
+    pub fn frame(
         &self,
         number: u64,
         wall: Option<f32>,
@@ -219,10 +237,10 @@ impl Host {
 
     /// A pipeline that fills the left half at this depth.
     fn wall(&self, depth: f32) -> wgpu::RenderPipeline {
-        let source = wgpu::ShaderSource::Wgsl(SHADER.replace("DEPTH", &format!("{depth:.7}")).into());
-        let module = &self
-            .device
-            .create_shader_module(wgpu::ShaderModuleDescriptor { label: None, source });
+        let source =
+            wgpu::ShaderSource::Wgsl(SHADER.replace("DEPTH", &format!("{depth:.7}")).into());
+        let module =
+            &self.device.create_shader_module(wgpu::ShaderModuleDescriptor { label: None, source });
         let compilation_options = wgpu::PipelineCompilationOptions::default();
         self.device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
             label: None,
