@@ -290,7 +290,7 @@ fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
         tile_columns: COLUMNS,
         longest_run: u32::MAX,
         has_limits: 0,
-        takes_median: 0,
+        depth_kind: 0,
         background,
     };
     let pixels = size.element_product() as usize;
