@@ -287,8 +287,11 @@ impl Reference for Kernel {
     }
 }
 
+/// Of every channel.
 fn background(params: &Params, constants: &Constants) -> Vec<f64> {
-    params.background[..constants.channels as usize].iter().map(|&c| c.into()).collect()
+    let mut background = params.background.map(f64::from).to_vec();
+    background.resize(constants.channels as usize, 0.0);
+    background
 }
 
 /// The pixels of a tile that are inside the image, row by row.

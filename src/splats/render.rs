@@ -39,7 +39,6 @@ use glam::{UVec2, Vec2};
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads, Tile};
 use crate::kernels::blend_forward::{DEPTH_MEAN, DEPTH_SUM};
-use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{self, blend_backward, blend_forward, emit, order_counts, project_backward};
 use crate::splats::batches::GradientKind;
 use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
@@ -262,8 +261,6 @@ impl Renderer {
     ) -> Result<()> {
         pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
         self.record_bins(pass, gaussian_count, view, capacity)?;
-        let mut background = [0.0; MAX_CHANNELS as usize];
-        background[..3].copy_from_slice(&options.background);
         let frame = &mut self.frame;
         let with_depths = self.blend_depths.as_ref().filter(|_| depths.is_some());
         pass.dispatch(
@@ -274,7 +271,7 @@ impl Renderer {
                 longest_run: self.longest_run,
                 has_limits: depths.is_some_and(|depths| depths.has_limits).into(),
                 depth_kind: depths.map_or(DEPTH_SUM, |depths| depths.kind),
-                background,
+                background: options.background,
             },
             blend_forward::Buffers {
                 counts: frame.counts.slice(),

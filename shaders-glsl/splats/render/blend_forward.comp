@@ -23,7 +23,7 @@ layout(push_constant, scalar) uniform Params {
     uvec2 size;
     uint tile_columns;
     uint longest_run;  // the most splats of a tile that this device can process
-    float background[MAX_CHANNELS];
+    float background[3];  // of the colours; that of other channels is 0
     uint has_limits;    // 1: `limits` has a depth for each pixel
     uint depth_kind;    // DEPTH_*: the last channel, with VIEW_DEPTHS
 };
@@ -150,7 +150,8 @@ void main() [[subgroup_uniform_control_flow]] {
             float last = abs(transmittance[g]);
             transmittances[at] = last;
             [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                render[c * size.x * size.y + at] = color[g][c] + last * background[c];
+                float behind = c < 3 ? last * background[c] : 0.0;
+                render[c * size.x * size.y + at] = color[g][c] + behind;
             }
             if (VIEW_DEPTHS != 0 && depth_kind != DEPTH_SUM) {
                 float alpha = 1.0 - last;
