@@ -70,7 +70,7 @@ fn the_chain_s_gradients_agree_with_central_differences_through_a_fisheye() {
     }
 }
 
-/// The mean depth is the last channel, after features too, with segments and without.
+/// The mean depth is the last channel, after features too.
 #[test]
 fn the_gradient_of_mean_depths_agrees_with_central_differences() {
     for (model, channels) in [(CameraModel::Pinhole, 3), (fisheye(), 3), (CameraModel::Pinhole, 5)]
@@ -79,9 +79,6 @@ fn the_gradient_of_mean_depths_agrees_with_central_differences() {
         let mut setup = Setup::seen_by(model, 7, SIZE, shape, 23);
         setup.settings.trains_depth = true;
         check(&setup, &format!("mean depth, {model:?}, {channels}"));
-        let lanes = gpu().properties().subgroup_size;
-        let segments = Setup { segment: Some(lanes), ..setup };
-        Chain::new(&segments).assert_agrees_with_the_device("mean depth in segments");
     }
 }
 

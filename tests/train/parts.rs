@@ -278,8 +278,8 @@ fn normal_maps_are_found_and_turned_and_bad_ones_are_left_out() {
         let is_left_out = names[..2].contains(&report.view);
         assert_eq!(report.term(Term::NORMALS) == 0.0, is_left_out, "{report:?}");
     }
-    let (again, _) = train(&config, &dataset);
-    assert_eq!(format!("{again:?}"), format!("{reports:?}"), "the same bits");
+    let (_, again) = train(&config, &dataset);
+    assert_eq!(again.parameters, gaussians.parameters, "the same bits");
 
     fs::remove_dir_all(&maps).unwrap();
     let (plain, _) = train(&config, &load(&folder, &config));

@@ -150,8 +150,7 @@ void main() [[subgroup_uniform_control_flow]] {
             float last = abs(transmittance[g]);
             transmittances[at] = last;
             [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                float behind = c < 3 ? last * background[c] : 0.0;
-                render[c * size.x * size.y + at] = color[g][c] + behind;
+                render[c * size.x * size.y + at] = color[g][c] + (c < 3 ? last * background[c] : 0.0);
             }
             if (VIEW_DEPTHS != 0 && depth_kind != DEPTH_SUM) {
                 float alpha = 1.0 - last;
