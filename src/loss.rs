@@ -9,6 +9,7 @@ mod depth;
 pub mod exposure;
 mod image;
 mod log;
+mod normals;
 mod parameters;
 mod structure;
 
@@ -20,18 +21,27 @@ use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
 
 use crate::gpu::{Buffer, Gpu, Recorder};
+use crate::kernels::Camera;
 use crate::splats::scene::{Feature, Features};
 use crate::{Error, Result};
 pub use denoising::DenoisingLoss;
 pub use depth::{DepthBoxes, DepthLoss};
 pub use image::{Loss, LossInputs};
 pub use log::{LogSlot, LossLog, LossLogDownload, StepLosses};
+pub use normals::NormalLoss;
 pub use parameters::{ParameterTerms, ParameterWeights};
 pub use structure::StructureLoss;
 
 /// All terms, in the order of the columns.
-pub const TERMS: [LossSpec; 6] =
-    [image::TARGET, image::DARK, structure::SPEC, depth::SPEC, denoising::SPEC, parameters::SPEC];
+pub const TERMS: [LossSpec; 7] = [
+    image::TARGET,
+    image::DARK,
+    structure::SPEC,
+    depth::SPEC,
+    normals::SPEC,
+    denoising::SPEC,
+    parameters::SPEC,
+];
 
 settings! {
 "model.weights."
@@ -49,6 +59,9 @@ pub struct Weights {
     structure: f64 = 0.01 => Rule::POSITIVE_OR_0;
     /// Weight of 1 minus the correlation with the depth map, over the view and over boxes.
     depth: f64 = 0.1 => Rule::POSITIVE_OR_0;
+    /// Weight of 1 minus the cosine between rendered normals and those of the normal map, at the first step; it falls
+    /// linearly to 0 at the last.
+    normals: f64 = 0.05 => Rule::POSITIVE_OR_0;
 }
 }
 
@@ -75,6 +88,8 @@ pub enum TermOn {
     Colors(fn(&Gpu, &LossConfig, Gradient) -> Result<Box<dyn LossTerm>>),
     /// The channels of a feature, whose gradient it writes.
     Feature(Feature, fn(&Gpu, &LossConfig) -> Result<Box<dyn LossTerm>>),
+    /// The mean depth in the view, whose gradient over alpha it writes.
+    ViewDepth(fn(&Gpu, &LossConfig) -> Result<Box<dyn LossTerm>>),
     /// Outputs of the networks.
     Networks,
     /// The parameters of the Gaussians, to whose gradient it adds; recorded by [`ParameterTerms`].
@@ -164,6 +179,8 @@ pub struct LossConfig {
     pub boxes: Stream,
     /// The features of the Gaussians.
     pub features: Features,
+    /// The steps of the run, over which a weight may decay.
+    pub steps: u64,
 }
 
 impl LossConfig {
@@ -192,8 +209,12 @@ impl LossConfig {
 pub struct ViewSource<'a> {
     /// Width and height in pixels.
     pub size: UVec2,
+    /// Its camera.
+    pub camera: Camera,
     /// Estimated depth, (H, W), larger is farther.
     pub depth: Option<&'a [f32]>,
+    /// Estimated normals, (H, W), as in `include/map_normal.glsl`; only of a pinhole.
+    pub normals: Option<&'a [u32]>,
     /// Returns the target, (3, H, W).
     pub target: Box<dyn Fn() -> Result<Arc<Buffer<f32>>> + 'a>,
 }
@@ -211,6 +232,8 @@ pub struct TermInputs<'a> {
     pub features: Features,
     /// (channels, H, W), not clamped.
     pub render: &'a Buffer<f32>,
+    /// (H, W)
+    pub transmittances: &'a Buffer<f32>,
     /// The image that is compared with the target, (3, H, W) or longer, not clamped: the colours of the render, at the
     /// view's exposure if that is learned.
     pub colors: &'a Buffer<f32>,
@@ -242,7 +265,11 @@ pub trait LossTerm: std::fmt::Debug + Send {
 
 /// The terms on the render of a model.
 #[derive(Debug)]
-pub struct Losses(Vec<Box<dyn LossTerm>>);
+pub struct Losses {
+    terms: Vec<Box<dyn LossTerm>>,
+    /// Whether the gradient has planes in addition to colour, of which not every term writes every pixel.
+    has_planes: bool,
+}
 
 impl Losses {
     /// Builds the terms; [`Losses::prepare`] prepares them for views.
@@ -254,18 +281,20 @@ impl Losses {
                     terms.push(build(gpu, config, gradient)?);
                     gradient = Gradient::Added;
                 }
+                TermOn::ViewDepth(build) => terms.push(build(gpu, config)?),
                 TermOn::Feature(feature, build) if config.features.has(feature) => {
                     terms.push(build(gpu, config)?);
                 }
                 TermOn::Feature(..) | TermOn::Networks | TermOn::Parameters => {}
             }
         }
-        Ok(Self(terms))
+        let has_planes = config.features != Features::NONE || config.weights.normals > 0.0;
+        Ok(Self { terms, has_planes })
     }
 
     /// Prepares the data that is constant for these views, and allocates for them.
     pub fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()> {
-        self.0.iter_mut().try_for_each(|term| term.prepare(views))
+        self.terms.iter_mut().try_for_each(|term| term.prepare(views))
     }
 
     /// Records every term of a step: dL/d render, (channels, H, W), and the values in the log.
@@ -276,11 +305,10 @@ impl Losses {
         d_render: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
-        if inputs.features != Features::NONE {
-            // Not every term writes every pixel of its planes.
+        if self.has_planes {
             pass.fill(d_render, 0);
         }
-        self.0.iter_mut().try_for_each(|term| term.record_step(pass, inputs, d_render, log))
+        self.terms.iter_mut().try_for_each(|term| term.record_step(pass, inputs, d_render, log))
     }
 }
 

@@ -58,6 +58,8 @@ mod norm_backward_sums;
 mod norm_forward;
 mod norm_merge;
 mod norm_statistics;
+pub mod normals;
+mod normals_backward;
 mod order_counts;
 mod pack_map;
 pub mod pack_pixels;

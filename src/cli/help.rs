@@ -40,7 +40,8 @@ const GROUPS: [(&str, &str); 6] = [
         "Model",
         "preset model parts sh-degree init freeze max-gaussians density near background ssim-weight raw-colors \
          antialiasing depth \
-         depth-is-disparity denoiser-stages denoiser-repeats denoiser-channels denoiser-precision denoiser-crop",
+         depth-is-disparity normals \
+         denoiser-stages denoiser-repeats denoiser-channels denoiser-precision denoiser-crop",
     ),
     ("Settings", "config set frame plan explain seed"),
     (

@@ -267,6 +267,9 @@ fn plan(args: &SweepArgs) -> crate::Result<(Vec<SweepTraining>, Dataset)> {
     if !dataset.train_views().any(|view| view.depth.is_some()) {
         trainings.retain(|it| it.run.point.value(PARTS) != Some(Part::Depth.name()));
     }
+    if !dataset.train_views().any(|view| view.normals.is_some()) {
+        trainings.retain(|it| it.run.point.value(PARTS) != Some(Part::Normals.name()));
+    }
     Ok((trainings, dataset))
 }
 

@@ -35,6 +35,9 @@ pub struct SynthArgs {
     /// without noise [of --lamp alone: 16]
     #[arg(long, value_name = "DEGREES", num_args = 0..=1, require_equals = true, default_missing_value = "16")]
     pub lamp: Option<f64>,
+    /// Write the normal map of every training view to `normals/`, for `train --parts normals`
+    #[arg(long)]
+    pub normals: bool,
     /// What the scene has at night
     #[command(flatten)]
     pub night: Night,
@@ -62,6 +65,7 @@ pub fn run(args: SynthArgs) -> anyhow::Result<()> {
         fisheye,
         lamp,
         night,
+        normals: args.normals,
         ..usual
     };
     let stops = args.brackets.map_or(vec![0.0], |stops| vec![-stops, 0.0, stops]);

@@ -168,12 +168,19 @@ mod tests {
     fn the_total_sums_distances_and_one_minus_similarities() {
         let config = LossConfig {
             ssim_weight: 0.25,
-            weights: Weights { denoising: 0.0, structure: 0.0, depth: 0.0, ..Weights::default() },
+            weights: Weights {
+                denoising: 0.0,
+                structure: 0.0,
+                depth: 0.0,
+                normals: 0.0,
+                ..Weights::default()
+            },
             low: 0.0,
             parameters: ParameterWeights::default(),
             depth_box: 1,
             boxes: Stream::new(0, 0),
             features: Features::NONE,
+            steps: 1,
         };
         let value = |term: Term| if term.is_likeness { 0.75 } else { 0.5 };
         let losses = StepLosses { status: 0, values: Term::all().map(value).collect() };

@@ -11,7 +11,7 @@ use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices, Toleranc
 use crate::kernels::splat::RECORD_HEAD;
 
 /// Adds what one pixel with the values `render` and the gradient `d_render` contributes to `gradient_records` (splats,
-/// record): the moments of dL/dsigma, from the first `shaping` channels, and the gradients of the colours.
+/// record): the moments of dL/dsigma, from the channels that `shapes` selects, and the gradients of the colours.
 #[expect(clippy::too_many_arguments, reason = "a pixel, its splats and its gradients")]
 pub fn blend_pixel_backward(
     splats: &[Splat],
@@ -20,7 +20,7 @@ pub fn blend_pixel_backward(
     d_render: &[f64],
     pixel: DVec2,
     alpha_max: f64,
-    shaping: usize,
+    shapes: impl Fn(usize) -> bool,
     gradient_records: &mut [f64],
 ) {
     let (channels, head) = (render.len(), RECORD_HEAD as usize);
@@ -33,7 +33,7 @@ pub fn blend_pixel_backward(
         for c in 0..channels {
             let color = colors[channels * fragment.index + c];
             record[head + c] += weight * d_render[c];
-            if c < shaping {
+            if shapes(c) {
                 d_alpha += (fragment.before * color - light[c]) * d_render[c];
             }
             light[c] -= weight * color;
@@ -43,6 +43,12 @@ pub fn blend_pixel_backward(
             add_moments(record, -fragment.alpha * d_alpha, fragment.d);
         }
     }
+}
+
+/// Whether a channel moves and shapes the splats.
+fn shapes(constants: &Constants, channel: usize) -> bool {
+    let Constants { channels, shaping_channels, view_depths, .. } = *constants;
+    channel < shaping_channels as usize || channel >= (channels - view_depths) as usize
 }
 
 /// A pixel of a tile: its centre, its render, and the gradient of that.
@@ -111,9 +117,9 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
         (constants.channels as usize, UVec2::new(constants.tile_width, constants.tile_height));
     let model = PixelModel::new(&list.splats, pixel.center, constants.alpha_max.into(), tile);
     let d = |c: usize| pixel.d_render[c].abs();
-    let shaping = channels.min(constants.shaping_channels as usize);
-    let d_sum: f64 = (0..shaping).map(d).sum();
-    let light: f64 = (0..shaping).map(|c| pixel.render[c].abs() * d(c)).sum();
+    let shaping = || (0..channels).filter(|&c| shapes(constants, c));
+    let d_sum: f64 = shaping().map(d).sum();
+    let light: f64 = shaping().map(|c| pixel.render[c].abs() * d(c)).sum();
     let light_error = model.error * list.largest_color(&pixel.render) * d_sum;
     // At the start of a segment, the colour before it has the error of a render, too.
     let renders = if constants.segment == 0 { 2.0 } else { 3.0 };
@@ -123,7 +129,7 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
     for &(fragment, alpha_error) in &model.fragments {
         let bound = &mut bounds[(head + channels) * fragment.index..][..head + channels];
         let color = &list.colors[channels * fragment.index..][..channels];
-        let share: f64 = (0..shaping).map(|c| fragment.before * color[c].abs() * d(c)).sum();
+        let share: f64 = shaping().map(|c| fragment.before * color[c].abs() * d(c)).sum();
         let rounded = 2.0 * alpha_error / (1.0 - fragment.alpha) + summed;
         let relative = if model.is_fragile { 1.0 } else { rounded };
         let d_alpha = (renders * light_error + relative * (light + share)) / (1.0 - fragment.alpha);
@@ -150,7 +156,7 @@ impl Reference for Kernel {
                 d_render,
                 *center,
                 alpha_max,
-                constants.shaping_channels as usize,
+                |c| shapes(constants, c),
                 sums,
             );
         });

@@ -6,7 +6,9 @@ use super::blending::PixelModel;
 use super::splat::{Fragment, Splat, fragments, is_done, stored_color};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
-use crate::kernels::blend_forward::{Constants, Kernel, NO_DEPTH, Params, Slices, Tolerances};
+use crate::kernels::blend_forward::{
+    Constants, DEPTH_MEAN, DEPTH_MEDIAN, Kernel, NO_DEPTH, Params, Slices, Tolerances,
+};
 use crate::kernels::status::STATUS_TILE_LIMIT;
 
 /// One pixel's channels and transmittance, from splats front to back with colours (splats, channels).
@@ -133,9 +135,14 @@ fn seen(
     (0..all).take_while(|&i| list.depth(i) <= limit || limit.is_nan()).count()
 }
 
-/// Whether the last channel is the median depth instead of the mean one.
-fn takes_median(params: &Params, constants: &Constants) -> bool {
-    constants.view_depths != 0 && params.takes_median != 0
+/// Whether the last channel is a depth of this kind, `DEPTH_*`.
+fn keeps(kind: u32, params: &Params, constants: &Constants) -> bool {
+    constants.view_depths != 0 && params.depth_kind == kind
+}
+
+/// The sum of the weighted depths over alpha; 0 where nothing is visible.
+pub fn mean_depth(sum: f64, transmittance: f64) -> f64 {
+    if transmittance < 1.0 { sum / (1.0 - transmittance) } else { 0.0 }
 }
 
 /// The depth at which the transmittance passes 1/2, and whether a rounding of it decides.
@@ -213,8 +220,11 @@ impl Reference for Kernel {
         for_each_pixel(params, constants, &slices, |list, seen, center, at| {
             let (mut values, transmittance) =
                 blend_pixel(seen, &list.colors, &background, center, alpha_max);
-            if takes_median(params, constants) {
-                let last = values.len() - 1;
+            let last = values.len() - 1;
+            if keeps(DEPTH_MEAN, params, constants) {
+                values[last] = mean_depth(values[last], transmittance);
+            }
+            if keeps(DEPTH_MEDIAN, params, constants) {
                 values[last] = median(list, &fragments(seen, center, alpha_max).0, 0.0).0;
             }
             transmittances[at] = transmittance as f32;
@@ -231,18 +241,29 @@ impl Reference for Kernel {
         let mut errors = vec![0.0; pixels];
         let mut largest_colors = vec![0.0; pixels];
         let mut medians = vec![0.0; pixels];
+        let mut alphas = vec![0.0; pixels];
         let tile_size = UVec2::new(constants.tile_width, constants.tile_height);
         for_each_pixel(params, constants, &slices, |list, seen, center, at| {
             errors[at] = PixelModel::new(seen, center, alpha_max, tile_size).error;
             largest_colors[at] = list.largest_color(&background);
-            let (_, is_fragile) = median(list, &fragments(seen, center, alpha_max).0, errors[at]);
+            let (fragments, transmittance) = fragments(seen, center, alpha_max);
+            alphas[at] = 1.0 - transmittance;
+            let (_, is_fragile) = median(list, &fragments, errors[at]);
             medians[at] = if is_fragile { f64::INFINITY } else { 0.0 };
         });
         let of_channel = errors.iter().zip(largest_colors).map(|(error, color)| error * color);
         let mut render: Vec<f64> =
             of_channel.cycle().take(constants.channels as usize * pixels).collect();
-        if takes_median(params, constants) {
-            render.splice(render.len() - pixels.., medians);
+        let first = render.len() - pixels;
+        if keeps(DEPTH_MEDIAN, params, constants) {
+            render.splice(first.., medians);
+        }
+        if keeps(DEPTH_MEAN, params, constants) {
+            for (bound, (error, alpha)) in render[first..].iter_mut().zip(errors.iter().zip(alphas))
+            {
+                let least = alpha - error;
+                *bound = if least > 0.0 { 3.0 * *bound / least } else { f64::INFINITY };
+            }
         }
         let stride = (constants.tile_width * constants.tile_height) as usize;
         let mut states = vec![0.0; slices.segment_states.len()];
@@ -266,8 +287,11 @@ impl Reference for Kernel {
     }
 }
 
+/// Of every channel.
 fn background(params: &Params, constants: &Constants) -> Vec<f64> {
-    params.background[..constants.channels as usize].iter().map(|&c| c.into()).collect()
+    let mut background = params.background.map(f64::from).to_vec();
+    background.resize(constants.channels as usize, 0.0);
+    background
 }
 
 /// The pixels of a tile that are inside the image, row by row.

@@ -25,8 +25,8 @@ fn for_each_pixel(
         let mut list = TileList::new(constants.channels, run, gaussian_ids, splats, colors);
         let is_seen = |&splat: &usize| {
             // A limit that is not a number hides nothing.
-            let limit = f64::from(slices.limits[at as usize]);
-            params.has_limits == 0 || limit.is_nan() || list.depth(splat) <= limit
+            let is_hidden_by = |limit: f32| list.depth(splat) > limit.into();
+            params.has_limits == 0 || !is_hidden_by(slices.limits[at as usize])
         };
         let seen = (0..list.splats.len()).take_while(is_seen).count();
         list.splats.truncate(seen);

@@ -31,6 +31,8 @@ pub struct DSplat {
     pub color: DVec3,
     /// With respect to the features.
     pub features: Vec<f64>,
+    /// With respect to the depth in the view, where that is a channel.
+    pub depth: f64,
 }
 
 /// A colour that a lamp lights.
@@ -78,6 +80,9 @@ pub fn project_gaussian_backward(
 
     let d_rows = [d_u0, d_u1].map(|d_u| camera.rotation * (scaled_axes * d_u));
     let mut d_mean_in_view = camera.backward(mean_in_view, d_splat.mean2d, d_rows);
+    let axes = [DVec3::X, DVec3::Y, DVec3::Z];
+    d_mean_in_view +=
+        d_splat.depth * DVec3::from_array(axes.map(|axis| camera.depth_change(mean_in_view, axis)));
     let mut d_color = d_splat.color;
     if let Some(Lit { lamp, color }) = lit {
         let d_log_factor;
@@ -182,9 +187,9 @@ impl<'a> BackwardInputs<'a> {
         cameras: &[kernels::Camera],
         lamp: &[f32],
     ) -> Self {
-        let Constants { channels, sh_degree, .. } = *constants;
-        let planes =
-            Planes::new(params.gaussian_count, channels, sh_degree, constants.rest_by_column);
+        let Constants { channels, sh_degree, view_depths, .. } = *constants;
+        let (count, channels) = (params.gaussian_count, channels - view_depths);
+        let planes = Planes::new(count, channels, sh_degree, constants.rest_by_column);
         let camera = ReferenceCamera::from(&cameras[params.camera_index as usize]);
         let lamp = constants.lamp.then(|| ReferenceLamp::from_numbers(lamp));
         Self { params, constants, camera, lamp, planes }
@@ -201,7 +206,8 @@ impl<'a> BackwardInputs<'a> {
             conic,
             opacity,
             color: DVec3::from_array([0, 1, 2].map(passes)),
-            features: record[HEAD + 3..].to_vec(),
+            features: record[HEAD + 3..][..self.planes.feature_count].to_vec(),
+            depth: if self.constants.view_depths == 0 { 0.0 } else { record[record.len() - 1] },
         }
     }
 

@@ -38,7 +38,7 @@ use std::collections::BTreeMap;
 use glam::{UVec2, Vec2};
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads, Tile};
-use crate::kernels::splat::MAX_CHANNELS;
+use crate::kernels::blend_forward::{DEPTH_MEAN, DEPTH_SUM};
 use crate::kernels::{self, blend_backward, blend_forward, emit, order_counts, project_backward};
 use crate::splats::batches::GradientKind;
 use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
@@ -127,11 +127,14 @@ pub struct Renderer {
 /// How the last channel of a render keeps the depth in the view.
 #[derive(Clone, Copy, Debug)]
 struct DepthChannel {
-    /// The median instead of the weighted sum.
-    takes_median: bool,
+    /// `DEPTH_*`.
+    kind: u32,
     /// Nothing beyond the limits is seen.
     has_limits: bool,
 }
+
+/// The depth that has a gradient.
+const TRAINED_DEPTH: DepthChannel = DepthChannel { kind: DEPTH_MEAN, has_limits: false };
 
 impl Renderer {
     /// The number of intersections of the last render; waits for it.
@@ -145,7 +148,7 @@ impl Renderer {
         &self.settings
     }
 
-    /// The last render, planar (channels, H, W): RGB, then the features.
+    /// The last render, planar (channels, H, W): RGB, then the features, then the mean depth if that is trained.
     pub fn render(&self) -> &Buffer<f32> {
         &self.frame.render
     }
@@ -176,10 +179,11 @@ impl Renderer {
         &self.frame.status
     }
 
-    /// The last render and the status words, for a loss that reads the former and sets flags in the latter.
+    /// The last render, its transmittances and the status words, for a loss that reads the former and sets flags in the
+    /// latter.
     #[doc(hidden)]
-    pub fn render_and_status(&mut self) -> (&Buffer<f32>, &mut Buffer<u32>) {
-        (&self.frame.render, &mut self.frame.status)
+    pub fn render_and_status(&mut self) -> (&Buffer<f32>, &Buffer<f32>, &mut Buffer<u32>) {
+        (&self.frame.render, &self.frame.transmittances, &mut self.frame.status)
     }
 
     /// The error for a view whose [`Status::splats_per_tile`] exceeds the limit.
@@ -220,7 +224,8 @@ impl Renderer {
         viewpoint: impl Into<Viewpoint<'a>>,
         options: &RenderOptions,
     ) -> Result<()> {
-        self.record_forward(pass, gaussians.into(), viewpoint, options, None)
+        let depths = self.settings.keeps_depth().then_some(TRAINED_DEPTH);
+        self.record_forward(pass, gaussians.into(), viewpoint, options, depths)
     }
 
     /// Records a render. `depths`: the last channel is the depth in the view.
@@ -256,8 +261,6 @@ impl Renderer {
     ) -> Result<()> {
         pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
         self.record_bins(pass, gaussian_count, view, capacity)?;
-        let mut background = [0.0; MAX_CHANNELS as usize];
-        background[..3].copy_from_slice(&options.background);
         let frame = &mut self.frame;
         let with_depths = self.blend_depths.as_ref().filter(|_| depths.is_some());
         pass.dispatch(
@@ -267,8 +270,8 @@ impl Renderer {
                 tile_columns: view.tiles.x,
                 longest_run: self.longest_run,
                 has_limits: depths.is_some_and(|depths| depths.has_limits).into(),
-                takes_median: depths.is_some_and(|depths| depths.takes_median).into(),
-                background,
+                depth_kind: depths.map_or(DEPTH_SUM, |depths| depths.kind),
+                background: options.background,
             },
             blend_forward::Buffers {
                 counts: frame.counts.slice(),
@@ -305,7 +308,8 @@ impl Renderer {
         d_render: &Buffer<f32>,
         gradients: Gradients<'_>,
     ) -> Result<()> {
-        let view = self.view(&viewpoint.into(), false, DepthOrder::Own)?;
+        let keeps_depth = self.settings.keeps_depth();
+        let view = self.view(&viewpoint.into(), keeps_depth, DepthOrder::Own)?;
         let gaussians = gaussians.into();
         self.check(&gaussians.layout)?;
         self.build_backward(view.kind)?;
@@ -321,7 +325,7 @@ impl Renderer {
             };
             return Err(Error::Usage(problem.to_owned()));
         };
-        let color_floats = color_floats(self.settings.channels());
+        let color_floats = color_floats(view.channels);
         let first = self.context_count();
         let (frame, tile_count) = (&mut self.frame, view.tile_count());
         let further_segments = frame.segments.blocks(frame.intersection_capacity());

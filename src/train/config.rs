@@ -15,7 +15,8 @@ use nightsplat_core::random::Stream;
 use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
 use nightsplat_photographs::dataset::{
-    DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize, PixelOrientation, RowBands,
+    DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize, NormalOptions, PixelOrientation,
+    RowBands,
 };
 use nightsplat_photographs::image::StoredLight;
 use nightsplat_photographs::tone::ToneSettings;
@@ -353,6 +354,11 @@ impl TrainConfig {
                 folder: self.model.depth_folder.clone(),
                 is_disparity: self.model.depth_is_disparity,
             },
+            normals: NormalOptions {
+                load: self.model.normals,
+                folder: self.model.normal_folder.clone(),
+                axes: self.model.normal_axes,
+            },
             ..LoadOptions::default()
         }
     }
@@ -362,20 +368,23 @@ impl TrainConfig {
         self.extent.unwrap_or_else(|| dataset.extent())
     }
 
-    /// Disables the depth part, with a warning, if no training view has a depth map.
+    /// Disables the parts depth and normals, with a warning, if no training view has such a map.
     pub(crate) fn disable_missing_parts(&mut self, dataset: &Dataset) {
-        if !self.model.depth {
-            return;
-        }
-        let count = dataset.train_views().filter(|view| view.depth.is_some()).count();
-        if count == 0 {
-            tracing::warn!(
-                "no view has a depth map (depth/NAME.png, or in model.depth_folder): no depth term"
-            );
-            self.model.depth = false;
-        } else {
-            let all = dataset.train_views().count();
-            tracing::info!("{count} of {all} training views have a depth map");
+        let ModelConfig { depth, normals, .. } = &mut self.model;
+        let depth_maps = dataset.train_views().filter(|view| view.depth.is_some()).count();
+        let normal_maps = dataset.train_views().filter(|view| view.normals.is_some()).count();
+        for (part, name, count) in [(depth, "depth", depth_maps), (normals, "normals", normal_maps)]
+        {
+            let map = name.trim_end_matches('s');
+            if *part && count == 0 {
+                tracing::warn!(
+                    "no view has a {map} map ({name}/NAME.png, or in model.{map}_folder): no {map} term"
+                );
+                *part = false;
+            } else if *part {
+                let all = dataset.train_views().count();
+                tracing::info!("{count} of {all} training views have a {map} map");
+            }
         }
     }
 
@@ -386,6 +395,7 @@ impl TrainConfig {
             &mut self.images,
             &mut self.reference,
             &mut self.model.depth_folder,
+            &mut self.model.normal_folder,
             &mut self.exposure.start,
         ];
         for folder in inside.into_iter().flatten() {
@@ -404,6 +414,7 @@ impl TrainConfig {
             antialiased: self.antialiasing.compensation,
             lamp: self.model.lamp.then_some(Lamp::AT_CAMERA),
             detach_geometry: self.model.network.variant == NetworkVariant::Identity,
+            trains_depth: self.model.effective_weights().normals > 0.0,
             tile: self.tile,
             patch_pixels: self.patch_pixels,
             near: (self.near * FRAME_EXTENT) as f32,
@@ -459,6 +470,7 @@ impl TrainConfig {
             depth_box: self.model.depth_box,
             boxes: Stream::new(self.seed, streams::BOXES),
             features: self.model.features(),
+            steps: self.steps,
         }
     }
 

@@ -7,6 +7,8 @@ use glam::UVec2;
 use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
 
+use nightsplat_photographs::dataset::NormalAxes;
+
 use crate::loss::{DepthBoxes, Weights};
 use crate::networks::{Denoiser, DenoiserSettings, NetworkVariant, Tonemapper};
 use crate::splats::scene::Features;
@@ -46,12 +48,14 @@ pub enum Part {
     Depth,
     /// A lamp that moves with the camera.
     Lamp,
+    /// A term that compares the normals of rendered depths with given ones.
+    Normals,
 }
 
 impl Part {
     /// Every part: those of the paper, in its order, and then others.
-    pub const ALL: [Self; 5] =
-        [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth, Self::Lamp];
+    pub const ALL: [Self; 6] =
+        [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth, Self::Lamp, Self::Normals];
 
     /// The parts of LITA-GS.
     #[doc(hidden)]
@@ -65,6 +69,7 @@ impl Part {
             Self::Structure => "structure",
             Self::Depth => "depth",
             Self::Lamp => "lamp",
+            Self::Normals => "normals",
         }
     }
 }
@@ -95,6 +100,8 @@ pub struct ModelConfig {
     depth: bool = false => Rule::Flag;
     /// A lamp that moves with the camera: colours are multiplied by its light, whose numbers are learned.
     lamp: bool = false => Rule::Flag;
+    /// Normals of the rendered depths are held to given normal maps; not for views without one.
+    normals: bool = false => Rule::Flag;
     /// Colour is the SH sum alone, as in LITA-GS, instead of max(SH + 0.5, 0), as in viewers.
     raw_colors: bool = false => Rule::Flag, "--raw-colors on|off";
     /// Train the networks on random crops of at most N x N pixels; 0: on whole views.
@@ -105,6 +112,11 @@ pub struct ModelConfig {
     depth_folder: Option<PathBuf> = None, "depth/ or depth_maps/ of the dataset" => Rule::PATH, "--depth DIR";
     /// Depth maps hold disparity, in which larger is nearer.
     depth_is_disparity: bool = false => Rule::Flag, "--depth-is-disparity";
+    /// Folder of normal maps in the camera's axes, `NAME.*` or `normal_NAME.*`: of 8 or 16 bits from -1 to 1, or EXR.
+    normal_folder: Option<PathBuf> = None, "normals/ or normal_maps/ of the dataset" => Rule::PATH, "--normals DIR";
+    /// The axes of normal maps: OpenCV's, y down and z away from the camera, or OpenGL's, y up and z towards it; auto:
+    /// those in which a map faces the camera.
+    normal_axes: NormalAxes = NormalAxes::Auto => Rule::OneOf(&NormalAxes::NAMES);
 }
 sections {
     /// The size of the denoiser, and the variant of the networks.
@@ -140,13 +152,15 @@ impl ModelConfig {
     /// The weights of the terms: 0 for parts that are off.
     pub(super) fn effective_weights(&self) -> Weights {
         let of = |has: bool, weight: f64| if has { weight } else { 0.0 };
-        let Weights { denoising, total_variation, low_ssim, structure, depth } = self.weights;
+        let Weights { denoising, total_variation, low_ssim, structure, depth, normals } =
+            self.weights;
         Weights {
             denoising: of(self.denoiser, denoising),
             total_variation: of(self.denoiser, total_variation),
             low_ssim,
             structure: of(self.structure, structure),
             depth: of(self.depth, depth),
+            normals: of(self.normals, normals),
         }
     }
 
@@ -177,6 +191,7 @@ impl ModelConfig {
             Part::Structure => self.structure,
             Part::Depth => self.depth,
             Part::Lamp => self.lamp,
+            Part::Normals => self.normals,
         }
     }
 
@@ -198,6 +213,7 @@ impl ModelConfig {
         self.structure = parts.contains(&Part::Structure);
         self.depth = parts.contains(&Part::Depth);
         self.lamp = parts.contains(&Part::Lamp);
+        self.normals = parts.contains(&Part::Normals);
     }
 
     /// The features of the Gaussians for the enabled parts.

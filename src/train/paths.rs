@@ -29,13 +29,14 @@ impl TrainConfig {
     /// The paths that are set.
     fn paths(&mut self) -> Vec<&mut PathBuf> {
         let Self { dataset, reference, init, tone, model, exposure, .. } = self;
+        let maps = [&mut model.depth_folder, &mut model.normal_folder];
         let optional =
-            [reference, init, &mut tone.law, &mut model.depth_folder, &mut exposure.start];
+            maps.into_iter().chain([reference, init, &mut tone.law, &mut exposure.start]);
         let targets = match &mut tone.curve {
             Tone::External(folder) => Some(folder),
             _ => None,
         };
-        let paths = optional.into_iter().flatten().chain(targets).chain([dataset]);
+        let paths = optional.flatten().chain(targets).chain([dataset]);
         paths.filter(|path| !path.as_os_str().is_empty()).collect()
     }
 }

@@ -198,7 +198,7 @@ impl Trainer {
         losses.prepare(&views.sources(&targets.pseudo_gt, dataset))?;
         let networks = NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?;
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
-        let values = config.render_settings().channels() * pixels.unwrap_or_default();
+        let values = config.render_settings().trained_channels() * pixels.unwrap_or_default();
         let pictures = views.largest_view_values();
         // Only networks use the photograph in addition to the target.
         let photographs = if networks.is_some() { pictures } else { 0 };

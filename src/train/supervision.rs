@@ -18,7 +18,7 @@ use crate::loss::exposure::{Affine, Exposures};
 use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, TermInputs};
 use crate::splats::optimizer::{Adam, Learnable};
 use crate::splats::render::Renderer;
-use crate::splats::scene::{COLOR_CHANNELS, Features};
+use crate::splats::scene::Features;
 use crate::targets::Targets;
 
 /// The training views with their targets, and the terms of the loss.
@@ -64,13 +64,21 @@ impl Supervision {
     ) -> Result<()> {
         let Self { views, targets, masks, d_render, losses, .. } = self;
         let view = views.get(id);
-        let (render, status) = renderer.render_and_status();
+        let channels = renderer.settings().trained_channels();
+        let (render, transmittances, status) = renderer.render_and_status();
         let (size, photograph) = (view.size(), view.photograph.0);
-        let channels = COLOR_CHANNELS + features.width();
         let target = views.record_target(pass, &targets.pseudo_gt, view, &mut self.target)?;
         let log = &mut LogSlot { log: &mut self.log, slot, status };
-        let inputs =
-            &TermInputs { step, view: id.0, size, features, render, colors: render, target };
+        let inputs = &TermInputs {
+            step,
+            view: id.0,
+            size,
+            features,
+            render,
+            transmittances,
+            colors: render,
+            target,
+        };
         let exposed = match &mut self.exposures {
             Some(exposures) => {
                 exposures.expose(pass, photograph, size, [render, target])?;
@@ -108,7 +116,7 @@ impl Supervision {
         slot: u32,
     ) -> Result<()> {
         let Some(terms) = &mut self.parameter_terms else { return Ok(()) };
-        let (_, status) = renderer.render_and_status();
+        let (_, _, status) = renderer.render_and_status();
         gaussians.record_terms(pass, terms, &mut LogSlot { log: &mut self.log, slot, status })
     }
 

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use glam::UVec2;
 use nightsplat_core::camera::Patch;
 use nightsplat_core::watch::Stage;
-use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::dataset::{Dataset, NormalMap};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::scene_tone::photographs;
 
@@ -35,6 +35,8 @@ pub(super) struct TrainView {
     pub(super) patch: Patch,
     /// The given depth, (H, W), if the dataset's map has another size.
     depth: Option<Vec<f32>>,
+    /// The given normals, (H, W), likewise.
+    normals: Option<Vec<u32>>,
     /// The stored image from which its target is made in every step: planar (3, H, W), sRGB-encoded.
     stored: CacheSlot,
     /// Whether that is the dark photograph, to which the curve is applied; else it is the target, tone-mapped at the
@@ -117,6 +119,7 @@ impl Views {
                 let is_as_loaded =
                     size == UVec2::new(image.width, image.height) && patches.len() == 1;
                 let depth = view.depth.as_ref().filter(|_| !is_as_loaded);
+                let normals = view.normals.as_ref().filter(|_| !is_as_loaded);
                 let print = LevelImage {
                     name: &view.name,
                     photograph: TrainingPhotograph(at),
@@ -125,6 +128,7 @@ impl Views {
                     dark: resized(&image),
                     target: whole.as_ref().filter(|_| photograph_size != Some(size)).map(resized),
                     depth: depth.map(|depth| resized_plane(depth, &image, size)),
+                    normals: normals.map(|map| map.resized(size.x, size.y)),
                 };
                 for patch in patches {
                     views.push(print.view(patch, &mut encoder, &mut cache)?);
@@ -184,7 +188,12 @@ impl Views {
     ) -> Vec<ViewSource<'a>> {
         let source = |view: &'a TrainView| ViewSource {
             size: view.size(),
+            camera: (&view.patch).into(),
             depth: view.depth.as_deref().or(dataset.views[view.in_dataset.0].depth.as_deref()),
+            normals: view
+                .normals
+                .as_deref()
+                .or_else(|| Some(dataset.views[view.in_dataset.0].normals.as_ref()?.packed())),
             target: Box::new(|| self.target(pseudo_gt, view)),
         };
         self.all.iter().map(source).collect()
@@ -378,6 +387,8 @@ struct LevelImage<'a> {
     keeps_dark: bool,
     /// The depth, if it differs from the dataset's map.
     depth: Option<Vec<f32>>,
+    /// The normals, likewise.
+    normals: Option<NormalMap>,
 }
 
 impl LevelImage<'_> {
@@ -398,6 +409,7 @@ impl LevelImage<'_> {
             in_dataset: self.in_dataset,
             patch,
             depth: self.depth.as_ref().map(|depth| patch.cut(depth).into_owned()),
+            normals: self.normals.as_ref().map(|map| patch.cut(map.packed()).into_owned()),
             stored,
             gets_curve: self.target.is_none(),
             dark,

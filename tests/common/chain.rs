@@ -3,7 +3,7 @@
 use glam::{DVec2, DVec3};
 use nightsplat::kernels::splat::RECORD_HEAD;
 use nightsplat::reference::blend_backward::blend_pixel_backward;
-use nightsplat::reference::blend_forward::blend_pixel;
+use nightsplat::reference::blend_forward::{blend_pixel, mean_depth};
 use nightsplat::reference::camera::ReferenceCamera;
 use nightsplat::reference::lamp::{self, ReferenceLamp};
 use nightsplat::reference::project::{Projection, ProjectionSettings, project_gaussian};
@@ -22,6 +22,8 @@ pub(crate) struct Chain<'a> {
     pub(crate) d_render: Vec<f64>,
     /// The lamp of the settings.
     pub(crate) lamp: Option<ReferenceLamp>,
+    /// (H, W) of the setup as it is: the gradient of the mean depth is given over alpha.
+    alphas: Vec<f64>,
 }
 
 /// The splats of a render, front to back, with the indices of their Gaussians.
@@ -52,11 +54,33 @@ impl<'a> Chain<'a> {
     /// With a random gradient of the render.
     pub(crate) fn new(setup: &'a Setup) -> Self {
         let mut random = Random::new(4);
-        let count = setup.channels() * setup.pixels();
+        let channels = setup.channels() + usize::from(setup.settings.trains_depth);
+        let count = channels * setup.pixels();
         // Values of f32, as on the device.
         let d_render = (0..count).map(|_| f64::from(random.between(-1.0, 1.0) as f32)).collect();
         let lamp = setup.settings.lamp.map(|lamp| ReferenceLamp::from_numbers(&lamp.numbers()));
-        Self { setup, d_render, lamp }
+        let mut chain = Self { setup, d_render, lamp, alphas: vec![] };
+        let transmittances = chain.run(&chain.parameters()).transmittances;
+        chain.alphas =
+            transmittances.into_iter().map(|transmittance| 1.0 - transmittance).collect();
+        chain
+    }
+
+    /// Values per pixel: those of the setup, and the mean depth if that is trained.
+    fn channels(&self) -> usize {
+        self.setup.channels() + usize::from(self.setup.settings.trains_depth)
+    }
+
+    /// The channels and the transmittance of a pixel.
+    fn pixel(&self, projected: &Projected, background: &[f64], center: DVec2) -> (Vec<f64>, f64) {
+        let Projected { splats, colors, .. } = projected;
+        let (mut values, transmittance) =
+            blend_pixel(splats, colors, background, center, self.alpha_max());
+        if self.setup.settings.trains_depth {
+            let last = values.len() - 1;
+            values[last] = mean_depth(values[last], transmittance);
+        }
+        (values, transmittance)
     }
 
     pub(crate) fn parameters(&self) -> Vec<f64> {
@@ -64,7 +88,9 @@ impl<'a> Chain<'a> {
     }
 
     pub(crate) fn background(&self) -> Vec<f64> {
-        self.setup.background().into_iter().map(f64::from).collect()
+        let mut background: Vec<f64> = self.setup.background().into_iter().map(f64::from).collect();
+        background.resize(self.channels(), 0.0);
+        background
     }
 
     fn project(&self, camera: &ReferenceCamera, parameters: &[f64]) -> Projected {
@@ -86,7 +112,10 @@ impl<'a> Chain<'a> {
             splats: visible.iter().map(|(_, p, _)| p.splat).collect(),
             colors: visible
                 .iter()
-                .flat_map(|(_, p, features)| [&p.color.to_array()[..], features].concat())
+                .flat_map(|(_, p, features)| {
+                    let depth = settings.trains_depth.then_some(p.depth);
+                    [&p.color.to_array()[..], features, depth.as_slice()].concat()
+                })
                 .collect(),
             depths: visible.iter().map(|(_, p, _)| p.depth).collect(),
         }
@@ -107,20 +136,25 @@ impl<'a> Chain<'a> {
 
     /// The functional's value.
     pub(crate) fn loss(&self, parameters: &[f64], background: &[f64]) -> f64 {
-        let Projected { splats, colors, .. } = self.project(&self.setup.camera(), parameters);
-        let pixel = |(center, d): (DVec2, Vec<f64>)| {
-            let (render, _) = blend_pixel(&splats, &colors, background, center, self.alpha_max());
+        let projected = self.project(&self.setup.camera(), parameters);
+        let pixel = |(at, (center, mut d)): (usize, (DVec2, Vec<f64>))| {
+            let (render, _) = self.pixel(&projected, background, center);
+            if self.setup.settings.trains_depth {
+                let last = d.len() - 1;
+                d[last] *= self.alphas[at];
+            }
             render.iter().zip(d).map(|(value, d)| value * d).sum::<f64>()
         };
-        self.pixels().map(pixel).sum()
+        self.pixels().enumerate().map(pixel).sum()
     }
 
     /// The render, and the gradients of the references' backward pass.
     pub(crate) fn run(&self, parameters: &[f64]) -> Results {
         let camera = self.setup.camera();
-        let Projected { ids, splats, colors, depths } = self.project(&camera, parameters);
+        let projected = self.project(&camera, parameters);
+        let Projected { ids, splats, colors, depths } = &projected;
         let (channels, pixels, background) =
-            (self.setup.channels(), self.setup.pixels(), self.background());
+            (self.channels(), self.setup.pixels(), self.background());
         let record = RECORD_HEAD as usize + channels;
         let mut gradient_records = vec![0.0; record * ids.len()];
         let mut results = Results {
@@ -133,14 +167,13 @@ impl<'a> Chain<'a> {
         };
         let alpha_max = self.alpha_max();
         for (at, (center, d)) in self.pixels().enumerate() {
-            let (values, transmittance) =
-                blend_pixel(&splats, &colors, &background, center, alpha_max);
+            let (values, transmittance) = self.pixel(&projected, &background, center);
             let list = &mut gradient_records;
-            let (alpha, shaping) = (alpha_max, channels);
-            blend_pixel_backward(&splats, &colors, &values, &d, center, alpha, shaping, list);
+            blend_pixel_backward(splats, colors, &values, &d, center, alpha_max, |_| true, list);
             for c in 0..channels {
                 results.render[c * pixels + at] = values[c];
-                results.d_background[c] += transmittance * d[c];
+                let is_seen = c < self.setup.channels() || transmittance < 1.0;
+                results.d_background[c] += if is_seen { transmittance * d[c] } else { 0.0 };
             }
             results.transmittances.push(transmittance);
         }
@@ -188,7 +221,8 @@ impl<'a> Chain<'a> {
             conic,
             opacity,
             color: DVec3::from_array([0, 1, 2].map(passes)),
-            features: record[9..].to_vec(),
+            features: record[9..][..self.setup.planes().feature_count].to_vec(),
+            depth: if self.setup.settings.trains_depth { record[record.len() - 1] } else { 0.0 },
         }
     }
 
@@ -219,18 +253,21 @@ impl<'a> Chain<'a> {
             assert_close(&format!("{name}: {what}"), actual, &expected, bound);
         };
         let mut rendered = self.setup.render();
-        check("render", &rendered.render, |results| &results.render, 1.0);
+        // The mean depth is divided by alpha, which is 1/255 at least where there is a splat.
+        let [of_render, of_gradient] =
+            if self.setup.settings.trains_depth { [256.0, 16.0] } else { [1.0; 2] };
+        check("render", &rendered.render, |results| &results.render, of_render);
         check("transmittance", &rendered.transmittances, |results| &results.transmittances, 1.0);
         let d_render: Vec<f32> = self.d_render.iter().map(|&d| d as f32).collect();
         let gradients = rendered.backward(&d_render);
-        check("gradient", &gradients.parameters, |results| &results.gradient, 1.0);
+        check("gradient", &gradients.parameters, |results| &results.gradient, of_gradient);
         let trained = Setup { is_trained: true, ..self.setup.clone() };
         let completed = trained.render().backward(&d_render);
-        check("Adam's gradient", &completed.parameters, |results| &results.gradient, 1.0);
+        check("Adam's gradient", &completed.parameters, |results| &results.gradient, of_gradient);
         assert_eq!(completed.grad_norm_sums, gradients.grad_norm_sums, "{name}");
         let norms: Vec<f32> =
             gradients.grad_norm_sums.iter().map(|sum| sum - Rendered::NORM_BEFORE).collect();
-        check("gradient norm", &norms, |results| &results.grad_norms, 1.0);
+        check("gradient norm", &norms, |results| &results.grad_norms, of_gradient);
         for (i, &visits) in gradients.visit_counts.iter().enumerate() {
             let visits = visits - Rendered::VISITS_BEFORE;
             let leaves_a_trace = exact.grad_norms[i] > 0.0;

@@ -210,6 +210,9 @@ impl Setup {
         let mut rendered = Rendered::new(self);
         let Rendered { renderer, gaussians, .. } = &mut rendered;
         renderer.render_channels(&*gaussians, &self.camera, &self.options).unwrap();
+        if self.settings.trains_depth {
+            rendered.forward();
+        }
         rendered.download()
     }
 

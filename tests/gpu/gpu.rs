@@ -283,15 +283,13 @@ fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
         ..blend_forward::Constants::default()
     };
     let pipeline = gpu.pipeline::<blend_forward::Kernel>(&constants).unwrap();
-    let mut background = [0.0; 11];
-    background[..3].copy_from_slice(&[0.25, 0.5, 0.75]);
     let params = blend_forward::Params {
         size,
         tile_columns: COLUMNS,
         longest_run: u32::MAX,
         has_limits: 0,
-        takes_median: 0,
-        background,
+        depth_kind: 0,
+        background: [0.25, 0.5, 0.75],
     };
     let pixels = size.element_product() as usize;
     let mut tile_ranges = gpu.zeros("tile_ranges", (ROWS * COLUMNS) as usize).unwrap();

@@ -10,6 +10,7 @@ mod denoising;
 mod depth;
 mod image;
 mod log;
+mod normals;
 mod parameters;
 mod structure;
 
@@ -57,7 +58,16 @@ fn log_step(
 
 /// A step of a term on the first view and a render with these features.
 fn term_inputs(size: UVec2, features: Features, render: &Buffer<f32>, step: u64) -> TermInputs<'_> {
-    TermInputs { step, view: 0, size, features, render, colors: render, target: render }
+    TermInputs {
+        step,
+        view: 0,
+        size,
+        features,
+        render,
+        transmittances: render,
+        colors: render,
+        target: render,
+    }
 }
 
 /// Prints the first mismatches, so that a failure shows its pattern.

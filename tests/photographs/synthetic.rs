@@ -1,6 +1,6 @@
 //! The synthetic dataset has its documented layout, loads, and depends only on its options, byte for byte.
 
-use nightsplat_photographs::dataset::LoadOptions;
+use nightsplat_photographs::dataset::{LoadOptions, NormalOptions};
 use nightsplat_synth::{DARKENING, Night};
 
 use crate::common::command::{refused, run};
@@ -15,6 +15,7 @@ const SMALL: SyntheticOptions = SyntheticOptions {
     street: None,
     lamp: None,
     night: Night::NONE,
+    normals: false,
 };
 
 /// Every file below a folder, by relative path.
@@ -156,6 +157,38 @@ fn the_dark_photograph_is_the_reference_darkened_in_linear_light() {
         steps[steps.len() / 4] / encoded_mean(image)
     };
     assert!(roughness(&low) > 1.3 * roughness(&high), "{} {}", roughness(&low), roughness(&high));
+}
+
+/// The floor is z = 0 in the world.
+#[test]
+fn normal_maps_face_the_camera_and_have_the_normal_of_the_floor() {
+    let dir = tempfile::tempdir().unwrap();
+    let set = dir.path().join("set");
+    run(
+        &format!("synth {} --views 10 --width 48 --height 36 --seed 5 --normals", set.display()),
+        0,
+    );
+    let (maps, others): (BTreeMap<_, _>, BTreeMap<_, _>) =
+        files(&set).into_iter().partition(|(name, _)| name.starts_with("normals/"));
+    assert_eq!(others, files(written(&SMALL).path()), "the photographs are the same");
+    assert_eq!(maps.len(), 8, "{:?}", maps.keys());
+    let normals = NormalOptions { load: true, ..NormalOptions::default() };
+    let dataset = Dataset::load(&set, &LoadOptions { normals, ..LoadOptions::default() }).unwrap();
+    assert!(dataset.test_views().all(|view| view.normals.is_none()));
+    for view in dataset.train_views() {
+        assert_eq!(view.normals.as_ref().unwrap().packed().len(), 48 * 36);
+        let map = Image::load_as_stored(set.join(format!("normals/{}.png", view.name))).unwrap();
+        let mut floor = 0;
+        for (x, y) in (0..36).flat_map(|y| (0..48).map(move |x| (x, y))) {
+            let normal = 2.0 * Vec3::from_array(map.pixel(x, y)).as_dvec3() - 1.0;
+            let ray = view.camera.in_view(DVec2::new(x.into(), y.into()) + 0.5, 1.0).unwrap();
+            assert!((normal.length() - 1.0).abs() < 1e-3, "{x} {y} {normal}");
+            assert!(normal.dot(ray) < 1e-3, "{x} {y} {normal}");
+            let in_world = view.camera.view_from_world.matrix3.transpose() * normal;
+            floor += usize::from(in_world.distance(DVec3::Z) < 1e-3);
+        }
+        assert!(floor > 48 * 36 / 8, "{}: {floor}", view.name);
+    }
 }
 
 #[test]

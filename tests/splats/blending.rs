@@ -5,6 +5,7 @@ use std::f64::consts::TAU;
 
 use glam::DMat2;
 use nightsplat::gpu::Tile;
+use nightsplat::kernels::blend_forward::{DEPTH_MEAN, DEPTH_MEDIAN, DEPTH_SUM};
 use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::{ProjectedSplat, blend_backward, blend_forward};
 use nightsplat::reference::splat::{Splat, splat_level};
@@ -110,7 +111,7 @@ impl Tiles {
         &self,
         constants: blend_forward::Constants,
         limits: &[f32],
-        median: bool,
+        depth_kind: u32,
     ) -> Blended {
         let (splats, colors, sorted_tiles) = (&self.splats, &self.colors, &self.sorted_tiles);
         let (sorted_intersections, gaussian_ids) = self.slots();
@@ -125,9 +126,9 @@ impl Tiles {
             size: self.size,
             tile_columns: self.columns,
             longest_run: self.longest_run,
-            background: [0.25; 11],
+            background: [0.25; 3],
             has_limits: u32::from(limits.len() > 1),
-            takes_median: u32::from(median),
+            depth_kind,
         };
         let (render, transmittances, tile_ranges, status, segment_states) = run_kernel!(
             blend_forward,
@@ -253,7 +254,7 @@ fn splats_that_wait_in_shared_memory_are_blended_as_those_that_are_shuffled() {
         }
         let tiles = mixed_tiles(tile, channels);
         let forward =
-            |device| tiles.forward(tiles.forward_constants(segment, device), &[0.0], false);
+            |device| tiles.forward(tiles.forward_constants(segment, device), &[0.0], DEPTH_SUM);
         let blended = forward(CPU);
         assert!(forward(GPUS[0]) == blended, "{channels} {tile}");
         let shuffled = tiles.backward(&blended, segment, CPU);
@@ -270,19 +271,26 @@ fn splats_that_wait_in_shared_memory_are_blended_as_those_that_are_shuffled() {
 
 #[test]
 fn depths_end_pixels_and_are_their_median_on_every_device() {
-    for tile in suited([([8, 8], 1), ([16, 16], 4)]) {
-        let tiles = mixed_tiles(tile, 4);
+    // The last has all features.
+    for (tile, channels) in [(([8, 8], 1), 4), (([16, 16], 4), 4), (([8, 8], 1), 12)] {
+        let Some(tile) = suited([tile]).next() else { continue };
+        let tiles = mixed_tiles(tile, channels);
         let mut random = Random::new(9);
         let limits: Vec<f32> = (0..tiles.size.element_product())
             .map(|_| random.between(0.0, 0.01 * tiles.count() as f64) as f32)
             .collect();
-        for (limits, median) in [(&limits[..], false), (&limits, true), (&[0.0], true)] {
+        for (limits, kind) in [
+            (&limits[..], DEPTH_SUM),
+            (&limits, DEPTH_MEDIAN),
+            (&[0.0], DEPTH_MEDIAN),
+            (&[0.0], DEPTH_MEAN),
+        ] {
             let [passed, waiting] = [CPU, GPUS[0]].map(|device| {
                 let constants = tiles.forward_constants(0, device);
                 let constants = blend_forward::Constants { view_depths: 1, ..constants };
-                tiles.forward(constants, limits, median)
+                tiles.forward(constants, limits, kind)
             });
-            assert!(passed == waiting, "{tile} {} {median}", limits.len());
+            assert!(passed == waiting, "{tile} {channels} {} {kind}", limits.len());
         }
     }
 }
@@ -334,9 +342,9 @@ fn blended_pixels(tiles: &Tiles) -> Vec<bool> {
             size: tiles.size,
             tile_columns: tiles.columns,
             longest_run: u32::MAX,
-            background: [0.0; 11],
+            background: [0.0; 3],
             has_limits: 0,
-            takes_median: 0,
+            depth_kind: 0,
         };
         let buffers = blend_forward::Buffers {
             counts: counts.slice(),
@@ -391,7 +399,7 @@ fn no_row_that_an_ellipse_shows_on_is_skipped_and_few_others_are_blended() {
     for tile in suited([([16, 8], 1), ([8, 8], 1), ([16, 16], 4), ([4, 16], 1)]) {
         let mut tiles = ellipses(tile, 1500);
         tiles.colors.fill(0.5);
-        tiles.forward(tiles.forward_constants(0, GPUS[0]), &[0.0], false);
+        tiles.forward(tiles.forward_constants(0, GPUS[0]), &[0.0], DEPTH_SUM);
         let [visible, blended] = assert_none_is_missed(&tiles);
         // Seldom a row that the margin alone touches; half of the rows that a group has beside the first.
         let rows = gpu().properties().subgroup_size.div_ceil(tile.size[0]) as usize;
@@ -420,7 +428,7 @@ fn no_row_is_skipped_for_a_box_that_is_no_number_or_that_no_image_holds() {
             *[&mut splat.conic.x, &mut splat.conic.y, &mut splat.mean2d.y][i % 3] = f32::NAN;
         }
         tiles.colors.fill(1.0);
-        let blended = tiles.forward(tiles.forward_constants(0, GPUS[0]), &[0.0], false);
+        let blended = tiles.forward(tiles.forward_constants(0, GPUS[0]), &[0.0], DEPTH_SUM);
         assert!(blended.transmittances.iter().all(|&transmittance| transmittance == 1.0));
     }
 }
@@ -433,7 +441,7 @@ pub(crate) fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>
     (tiles.sorted_tiles, tiles.colors, tiles.longest_run) =
         (sorted_tiles, vec![0.5; 4 * count], longest_run);
     let Blended { tile_ranges, status, .. } =
-        tiles.forward(tiles.forward_constants(0, GPUS[0]), &[0.0], false);
+        tiles.forward(tiles.forward_constants(0, GPUS[0]), &[0.0], DEPTH_SUM);
     (tile_ranges, status)
 }
 

@@ -232,15 +232,19 @@ fn every_pass_of_the_rasteriser_agrees_with_its_reference_at_every_size() {
 #[test]
 fn the_passes_of_long_runs_agree_with_their_references_in_segments() {
     let lanes = gpu().properties().subgroup_size;
-    for (channels, size, subgroups) in
-        [(3, [16, 8], 1), (11, [16, 16], 1), (4, [16, 16], 2), (3, [16, 16], 4)]
-    {
+    for (channels, size, subgroups, trains_depth) in [
+        (3, [16, 8], 1, false),
+        (11, [16, 16], 1, false),
+        (4, [16, 16], 2, false),
+        (3, [16, 16], 4, false),
+        (5, [16, 8], 1, true),
+    ] {
         let tile = tile_of((size, subgroups));
         if !gpu().properties().suits_tile(tile) {
             continue;
         }
         let mut setup = Setup::opaque_above(channels);
-        setup.settings.tile = Some(tile);
+        (setup.settings.tile, setup.settings.trains_depth) = (Some(tile), trains_depth);
         let [whole, segments] = [0, 1].map(|segment| {
             setup.segment = Some(segment * lanes.max(16));
             assert_passes_agree(&setup)

@@ -91,7 +91,7 @@ fn errors_of(count: usize) -> [f64; 2] {
             &d,
             center,
             alpha_max,
-            3,
+            |c| c < 3,
             &mut gradient_records,
         );
     }

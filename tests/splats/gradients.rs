@@ -70,6 +70,18 @@ fn the_chain_s_gradients_agree_with_central_differences_through_a_fisheye() {
     }
 }
 
+/// The mean depth is the last channel, after features too.
+#[test]
+fn the_gradient_of_mean_depths_agrees_with_central_differences() {
+    for (model, channels) in [(CameraModel::Pinhole, 3), (fisheye(), 3), (CameraModel::Pinhole, 5)]
+    {
+        let shape = Shape { sh_degree: 1, features: features(channels) };
+        let mut setup = Setup::seen_by(model, 7, SIZE, shape, 23);
+        setup.settings.trains_depth = true;
+        check(&setup, &format!("mean depth, {model:?}, {channels}"));
+    }
+}
+
 /// The scales of a test are about a pixel, where most of the gradient is the compensation's.
 #[test]
 fn the_gradient_of_compensated_opacities_agrees_with_central_differences() {

@@ -42,7 +42,7 @@ fn an_overflow_renders_nothing_and_keeps_its_flag() {
     assert_shows_nothing(&rendered, &setup);
     // Neither a render that fits nor any other clears the flags.
     let flags = STATUS_OVERFLOWED | STATUS_NOT_FINITE;
-    gpu().write(rendered.renderer.render_and_status().1, &[flags, 7]).unwrap();
+    gpu().write(rendered.renderer.render_and_status().2, &[flags, 7]).unwrap();
     rendered.renderer.set_intersection_capacity(total).unwrap();
     rendered.forward();
     assert_eq!(gpu().read(rendered.renderer.status()).unwrap(), [flags, total, 0, flags]);

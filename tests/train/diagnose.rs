@@ -23,6 +23,7 @@ const SET: SyntheticOptions = SyntheticOptions {
     street: None,
     lamp: None,
     night: Night::NONE,
+    normals: false,
 };
 const MEMORY: u64 = 8 << 30;
 

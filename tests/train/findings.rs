@@ -19,6 +19,7 @@ const SET: SyntheticOptions = SyntheticOptions {
     street: None,
     lamp: None,
     night: nightsplat_synth::Night::NONE,
+    normals: false,
 };
 
 /// A dark set whose training photographs are changed by a function of photograph, column, row and linear light.

@@ -21,6 +21,7 @@ const SET: SyntheticOptions = SyntheticOptions {
     street: None,
     lamp: None,
     night: Night::NONE,
+    normals: false,
 };
 
 /// A room lit by one lamp: everything outside its light, including objects in front of walls, is black and has no

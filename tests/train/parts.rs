@@ -4,6 +4,7 @@ use nightsplat::loss::Term;
 use nightsplat::splats::attributes::{ATTRIBUTES, Attribute, AttributeSpec};
 use nightsplat::splats::model::Model;
 use nightsplat::train::{Part, Rendered, StepReport};
+use nightsplat_photographs::dataset::NormalMap;
 
 use crate::common::command::{Folder, json, says};
 use crate::common::prelude::*;
@@ -239,6 +240,50 @@ fn depth_maps_are_found_resized_negated_and_left_out_if_they_are_constant() {
     config.model.depth_folder = Some(folder.join("nowhere"));
     let error = Dataset::load(&folder, &config.load_options()).unwrap_err().to_string();
     assert!(error.contains("nowhere") && error.contains("depth"), "{error}");
+}
+
+/// Maps of half the size, as estimators return them, in OpenGL's axes; one of another shape, one without normals.
+#[test]
+fn normal_maps_are_found_and_turned_and_bad_ones_are_left_out() {
+    let folder = folder(false);
+    let config = TrainConfig { steps: 12, ..config(&[Part::Normals]) };
+    let names: Vec<String> =
+        load(&folder, &config).train_views().map(|view| view.name.clone()).collect();
+    let maps = folder.join("normals");
+    fs::create_dir(&maps).unwrap();
+    let normal = Vec3::new(0.6, 0.0, 0.8);
+    for (i, name) in names.iter().enumerate() {
+        let (width, height, value) = match i {
+            0 => (20, 40, [0.8, 0.5, 0.9]),
+            1 => (20, 15, [0.5; 3]),
+            _ => (20, 15, (0.5 * normal + 0.5).to_array()),
+        };
+        let map = Image::filled(width, height, value);
+        map.save_png16(maps.join(format!("normal_{name}.png"))).unwrap();
+    }
+    let dataset = load(&folder, &config);
+    let of = |name: &String| {
+        dataset.train_views().find(|view| view.name == *name).unwrap().normals.clone()
+    };
+    assert!(of(&names[0]).is_none() && of(&names[1]).is_none());
+    let expected = NormalMap::new(1, 1, [Vec3::new(0.6, 0.0, -0.8)]).packed()[0];
+    let found = of(&names[2]).unwrap();
+    assert_eq!(found.packed().len(), 40 * 30);
+    assert!(found.packed().iter().all(|&bits| bits == expected), "{:x}", found.packed()[0]);
+    assert!(dataset.test_views().all(|view| view.normals.is_none()));
+
+    let (reports, gaussians) = train(&config, &dataset);
+    assert_eq!(gaussians.shape.features.channels(), 3, "no feature is added");
+    for report in &reports {
+        let is_left_out = names[..2].contains(&report.view);
+        assert_eq!(report.term(Term::NORMALS) == 0.0, is_left_out, "{report:?}");
+    }
+    let (_, again) = train(&config, &dataset);
+    assert_eq!(again.parameters, gaussians.parameters, "the same bits");
+
+    fs::remove_dir_all(&maps).unwrap();
+    let (plain, _) = train(&config, &load(&folder, &config));
+    assert!(plain.iter().all(|report| report.term(Term::NORMALS) == 0.0));
 }
 
 #[test]

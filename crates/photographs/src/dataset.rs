@@ -21,6 +21,7 @@ mod locate;
 mod masks;
 mod members;
 mod names;
+mod normals;
 mod options;
 mod original;
 mod outside;
@@ -60,7 +61,8 @@ use listing::{select, warn};
 pub use masks::beside as mask_beside;
 pub use masks::is_beside as is_mask;
 use members::with_held_out;
-pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
+pub use normals::{NormalAxes, NormalMap};
+pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize, NormalOptions};
 pub use original::Original;
 pub use pictures::ViewPictures;
 pub use pixels::PhotographObserver;
@@ -114,6 +116,8 @@ const DARK_FOLDERS: [&str; 2] = ["low", "images_low"];
 const NORMAL_FOLDERS: [&str; 4] = ["high", "val", "test", "images"];
 /// Folders that may contain depth maps.
 const DEPTH_FOLDERS: [&str; 2] = ["depth", "depth_maps"];
+/// Folders that may contain normal maps.
+const NORMAL_MAP_FOLDERS: [&str; 2] = ["normals", "normal_maps"];
 
 /// The folder of the photographs in normal light, of a dataset that also has dark ones of the same names.
 pub fn bright_folder(root: &Path) -> Option<PathBuf> {
@@ -382,6 +386,9 @@ fn sources(
             let depth = (options.depth.load && split == Split::Train)
                 .then(|| frame.depth_file(root, options.depth.folder.as_deref(), files))
                 .flatten();
+            let normals = (options.normals.load && split == Split::Train)
+                .then(|| frame.normal_file(root, options.normals.folder.as_deref(), files))
+                .flatten();
             sources.push(ViewFiles {
                 name: frame.name.clone(),
                 split,
@@ -392,6 +399,7 @@ fn sources(
                 target: options.targets.as_ref().and_then(|folder| frame.find(folder, files)),
                 mask: masks::find(root, frame, files),
                 depth,
+                normals,
                 read: [None, None],
                 decoded_sizes: [None; 2],
                 size: (frame.lens.width, frame.lens.height),
@@ -442,12 +450,35 @@ impl ViewEntry {
         if folder.is_none() && self.depth.is_some() {
             return self.depth.clone();
         }
+        self.map_file(root, folder, DEPTH_FOLDERS, "depth", files)
+    }
+
+    /// The normal map, with the photograph's name or that name with the prefix `normal_`.
+    fn normal_file(
+        &self,
+        root: &Path,
+        folder: Option<&Path>,
+        files: &PhotographFiles,
+    ) -> Option<PathBuf> {
+        self.map_file(root, folder, NORMAL_MAP_FOLDERS, "normal", files)
+    }
+
+    /// The map with the photograph's name or that name with a prefix, in `folder` or in one of the dataset's.
+    fn map_file(
+        &self,
+        root: &Path,
+        folder: Option<&Path>,
+        own: [&str; 2],
+        prefix: &str,
+        files: &PhotographFiles,
+    ) -> Option<PathBuf> {
         let folders = match folder {
             Some(folder) => vec![folder.to_owned()],
-            None => DEPTH_FOLDERS.map(|name| root.join(name)).to_vec(),
+            None => own.map(|name| root.join(name)).to_vec(),
         };
         folders.iter().find_map(|folder| {
-            self.find(folder, files).or_else(|| files.find(folder, &format!("depth_{}", self.name)))
+            let prefixed = format!("{prefix}_{}", self.name);
+            self.find(folder, files).or_else(|| files.find(folder, &prefixed))
         })
     }
 

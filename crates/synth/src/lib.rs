@@ -46,6 +46,9 @@ trait Scene: Sync {
     /// The first point along a ray.
     fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3>;
 
+    /// The unit normal of the first surface along a ray.
+    fn first_normal(&self, origin: DVec3, direction: DVec3) -> Option<DVec3>;
+
     /// The position of camera `view` of `views`, and the unit vector from what it looks at towards it.
     fn camera_position(&self, view: usize, views: usize) -> [DVec3; 2];
 
@@ -87,6 +90,8 @@ pub struct SyntheticOptions {
     pub lamp: Option<f64>,
     /// What the scene has at night; not with `lamp`.
     pub night: Night,
+    /// Write the normal map of every training view, in 16 bits and OpenCV's axes, to `normals/`.
+    pub normals: bool,
 }
 
 impl Default for SyntheticOptions {
@@ -100,6 +105,7 @@ impl Default for SyntheticOptions {
             street: None,
             lamp: None,
             night: Night::NONE,
+            normals: false,
         }
     }
 }
@@ -182,7 +188,8 @@ pub fn write_captured(
     let dir = dir.as_ref();
     let (low, high, sparse) = (dir.join("low"), dir.join("high"), dir.join("colmap_sparse/0"));
     let lit = options.lamp.map(|_| dir.join("lit"));
-    for folder in [&low, &high, &sparse].into_iter().chain(&lit) {
+    let normals = options.normals.then(|| dir.join("normals"));
+    for folder in [&low, &high, &sparse].into_iter().chain(&lit).chain(&normals) {
         create_folder(folder)?;
     }
     // The lists of frames make the dataset look complete, so those of an earlier dataset are removed first, and new
@@ -212,6 +219,9 @@ pub fn write_captured(
             bright_photograph(&dim, camera).save_png8(lit.join(&name))?;
         }
         capture.photograph(&dim, camera, view, seed).save_png8(low.join(&name))?;
+        if let Some(normals) = normals.as_ref().filter(|_| !is_test(view)) {
+            normal_map(&*scene, camera).save_png16(normals.join(&name))?;
+        }
     }
     for (name, text) in colmap::model(&*scene, &cameras, draws, options.seed) {
         write_file(&sparse.join(name), &text)?;
@@ -288,6 +298,17 @@ fn render(scene: &dyn Scene, camera: &Camera, lights: &ViewLights) -> [Vec<DVec3
     };
     let (even, dim) = (0..camera.width * camera.height).into_par_iter().map(radiance).unzip();
     [even, dim]
+}
+
+/// (n + 1) / 2 of the normals in the view, at the centres of pixels; grey where there is no surface.
+fn normal_map(scene: &dyn Scene, camera: &Camera) -> Image {
+    let view_from_world = camera.view_from_world.matrix3;
+    Image::from_fn(camera.width, camera.height, |x, y| {
+        let ray = ray(camera, DVec2::new(x.into(), y.into()) + 0.5);
+        let normal = ray.and_then(|ray| scene.first_normal(camera.center(), ray));
+        let in_view = view_from_world * normal.unwrap_or_default();
+        (0.5 * in_view + 0.5).as_vec3().to_array()
+    })
 }
 
 /// The normal-light photograph.

@@ -262,6 +262,10 @@ impl Scene for Room {
         self.nearest(origin, direction).map(|(_, hit)| origin + hit.distance * direction)
     }
 
+    fn first_normal(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {
+        Some(self.nearest(origin, direction)?.1.normal)
+    }
+
     /// Cameras on a part of a sphere in front of the scene, spread evenly by a low-discrepancy sequence (Roberts' R2),
     /// so that every 8th is among the others. Those that walk come close, and look beside the focus.
     fn camera_position(&self, view: usize, _views: usize) -> [DVec3; 2] {

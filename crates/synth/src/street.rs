@@ -199,6 +199,10 @@ impl Scene for Street {
         self.nearest(origin, direction).map(|(_, hit)| origin + hit.distance * direction)
     }
 
+    fn first_normal(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {
+        Some(self.nearest(origin, direction)?.1.normal)
+    }
+
     /// Three lanes of cameras above the street, in turn, which look down at its middle and to the other side; every 8th
     /// is of each lane.
     fn camera_position(&self, view: usize, views: usize) -> [DVec3; 2] {

@@ -22,6 +22,11 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 // This many channels, from the first, move and shape the splats; of the others only the colours learn.
 layout(constant_id = 8) const uint SHAPING_CHANNELS = 3;
+// 1: so does the last channel, the mean depth z = sum_i z_i w_i / alpha. The gradient of a weight is d_z / alpha (z_i -
+// z): that of a sum of weighted depths with z as its background, whose gradient is d_z / alpha.
+layout(constant_id = 11) const uint VIEW_DEPTHS = 0;
+
+bool shapes(uint channel) { return channel < SHAPING_CHANNELS || channel >= CHANNELS - VIEW_DEPTHS; }
 
 layout(push_constant, scalar) uniform Params { uvec2 size; uint tile_columns; uint tile_count; };
 
@@ -31,7 +36,7 @@ layout(binding = 2) readonly  buffer GaussianIds  { uint gaussian_ids[]; };
 layout(binding = 3) readonly  buffer Splats  { ProjectedSplat splats[]; };
 layout(binding = 4) readonly  buffer Colors  { vec4 colors[]; };  // (Gaussians, COLOR_VECTORS)
 layout(binding = 5) readonly  buffer Render  { float render[]; };    // (CHANNELS, H, W)
-layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNELS, H, W)
+layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNELS, H, W); of the depth, over alpha
 // (slots, RECORD_VECTORS): moments of dL/dsigma 6, gradients of the colour CHANNELS, zeros
 layout(binding = 7) writeonly buffer GradientRecords { vec4 gradient_records[]; };
 layout(binding = 8) readonly  buffer Counts  { uint counts[]; };  // [0]: intersections
@@ -138,7 +143,7 @@ void main() [[subgroup_uniform_control_flow]] {
         light[g] = 0.0;
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
             d_pixel[g][c] = d_render[c * size.x * size.y + at];
-            if (c < SHAPING_CHANNELS) light[g] += render[c * size.x * size.y + at] * d_pixel[g][c];
+            if (shapes(c)) light[g] += render[c * size.x * size.y + at] * d_pixel[g][c];
         }
     }
 
@@ -149,7 +154,7 @@ void main() [[subgroup_uniform_control_flow]] {
             uint pixel = g * SUBGROUP_SIZE;
             transmittance[g] = segment_states[segment_state(block, 0) + pixel];
             [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                if (c < SHAPING_CHANNELS)
+                if (shapes(c))
                     light[g] -= segment_states[segment_state(block, 1 + c) + pixel] * d_pixel[g][c];
             }
         }
@@ -201,7 +206,7 @@ void main() [[subgroup_uniform_control_flow]] {
                     float shade = 0.0;
                     [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
                         if (!sums_colors_last()) record[RECORD_HEAD + c] += weight * d_pixel[g][c];
-                        if (c < SHAPING_CHANNELS) shade += splat.color[c / 4][c % 4] * d_pixel[g][c];
+                        if (shapes(c)) shade += splat.color[c / 4][c % 4] * d_pixel[g][c];
                     }
                     float passed = weight * shade;
                     light[g] -= passed;

@@ -16,15 +16,16 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //! all lanes. The tile's state stays in registers.
 //!
 //! With VIEW_DEPTHS the last channel is the depth in the view: a splat beyond a pixel's limit ends it, as the order is
-//! front to back. The channel is the sum of the weighted depths, or the depth at which the transmittance passes 1/2.
+//! front to back. The channel is the sum of the weighted depths, that sum over alpha, or the depth at which the
+//! transmittance passes 1/2.
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;
     uint tile_columns;
     uint longest_run;  // the most splats of a tile that this device can process
-    float background[MAX_CHANNELS];
+    float background[3];  // of the colours; that of other channels is 0
     uint has_limits;    // 1: `limits` has a depth for each pixel
-    uint takes_median;  // 1: the last channel is the median depth
+    uint depth_kind;    // DEPTH_*: the last channel, with VIEW_DEPTHS
 };
 
 layout(binding = 0) readonly  buffer Counts     { uint counts[]; };        // [0]: intersections
@@ -41,6 +42,9 @@ layout(binding = 10) readonly buffer Limits     { float limits[]; };  // (H, W) 
 layout(binding = 11) writeonly buffer SegmentStates { float segment_states[]; };  // include/segments.glsl
 
 layout(constant_id = 11) const uint VIEW_DEPTHS = 0;  // 1: the last channel is the depth
+const uint DEPTH_SUM = 0;
+const uint DEPTH_MEDIAN = 1;
+const uint DEPTH_MEAN = 2;  // 0 where nothing is visible
 // The depth of a pixel without a limit, and of one where nothing is visible.
 const float NO_DEPTH = 3.4e38;
 
@@ -146,10 +150,12 @@ void main() [[subgroup_uniform_control_flow]] {
             float last = abs(transmittance[g]);
             transmittances[at] = last;
             [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                render[c * size.x * size.y + at] = color[g][c] + last * background[c];
+                render[c * size.x * size.y + at] = color[g][c] + (c < 3 ? last * background[c] : 0.0);
             }
-            if (VIEW_DEPTHS != 0 && takes_median != 0) {
-                render[(CHANNELS - 1) * size.x * size.y + at] = median[g];
+            if (VIEW_DEPTHS != 0 && depth_kind != DEPTH_SUM) {
+                float alpha = 1.0 - last;
+                float mean = alpha > 0.0 ? color[g][CHANNELS - 1] / alpha : 0.0;
+                render[(CHANNELS - 1) * size.x * size.y + at] = depth_kind == DEPTH_MEDIAN ? median[g] : mean;
             }
         }
     }

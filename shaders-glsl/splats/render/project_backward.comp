@@ -54,7 +54,8 @@ layout(binding = 9) buffer VisitCounts  { uint visit_counts[]; };
 layout(binding = 10) readonly buffer Cameras { Camera cameras[]; };
 layout(binding = 11) readonly buffer LampNumbers { float lamp[]; };  // (LAMP_NUMBERS), read with LAMP
 
-const uint FEATURE_COUNT = CHANNELS - 3;
+layout(constant_id = 11) const uint VIEW_DEPTHS = 0;  // 1: the last channel is the depth, not a feature
+const uint FEATURE_COUNT = CHANNELS - 3 - VIEW_DEPTHS;
 
 #include "rest.glsl"
 #include "gradient_records.glsl"
@@ -184,6 +185,12 @@ void main() {
     vec3 d_row0 = view_rotation * (scaled_axes * d.u0);
     vec3 d_row1 = view_rotation * (scaled_axes * d.u1);
     vec3 d_mean_in_view = camera_backward(mean_in_view, camera, d_mean2d, d_row0, d_row1);
+    if (VIEW_DEPTHS != 0) {
+        for (uint k = 0; k < 3; k++) {
+            vec3 axis = vec3(equal(uvec3(k), uvec3(0, 1, 2)));
+            d_mean_in_view[k] += record[RECORD_HEAD + CHANNELS - 1] * camera_depth_change(mean_in_view, axis, camera);
+        }
+    }
     if (LAMP) {
         Lamp loaded = load_lamp();
         LampPoint at = lamp_at(loaded, mean_in_view);

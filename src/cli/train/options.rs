@@ -64,7 +64,7 @@ struct SeveralSettings {
     /// plain: 3DGS; lita: all parts of LITA-GS, with L1 alone on R_0 [default: plain]
     #[arg(long, value_parser = NamedValues::<ModelName>::new(["plain", "lita"]))]
     model: Option<ModelName>,
-    /// Parts of the model: any of denoiser, tonemapper, structure, depth
+    /// Parts of the model: any of denoiser, tonemapper, structure, depth, lamp, normals
     #[arg(long, value_name = "LIST", value_delimiter = ',', value_parser = words::parts())]
     parts: Option<Vec<Part>>,
     /// draft, fast, balanced or best: quality for time; paper: the paper's curve and length; lom, realx3d or
@@ -98,6 +98,7 @@ impl TrainOptions {
             match key {
                 "model.denoiser_crop" => &[Part::Denoiser, Part::Tonemapper],
                 "model.depth_folder" | "model.depth_is_disparity" => &[Part::Depth],
+                "model.normal_folder" => &[Part::Normals],
                 _ if key.starts_with("model.network.") => &[Part::Denoiser],
                 _ => &[],
             }

@@ -267,8 +267,7 @@ impl RenderBuffers {
 pub(super) struct Segments {
     /// Splats; 0: a run has one segment.
     pub(super) length: u32,
-    /// Floats of the state of a tile's pixels before a segment: transmittance and channels. Depths are not blended
-    /// backward and have no part in it.
+    /// Floats of the state of a tile's pixels before a segment: transmittance and channels.
     pub(super) state: u32,
 }
 

@@ -4,12 +4,13 @@ use nightsplat_core::camera::{Camera, Patch};
 
 use super::{DepthChannel, ProjectionKind, RenderOptions, Renderer};
 use crate::Result;
+use crate::kernels::blend_forward::DEPTH_MEDIAN;
 use crate::kernels::pack_pixels::NOTHING_SEEN;
 use crate::splats::camera::model_number;
 use crate::splats::scene::DeviceGaussians;
 
 /// The median depth, of everything in view.
-const MEDIAN: DepthChannel = DepthChannel { takes_median: true, has_limits: false };
+const MEDIAN: DepthChannel = DepthChannel { kind: DEPTH_MEDIAN, has_limits: false };
 
 impl Renderer {
     /// The median depth of each pixel, (H, W), world units: the depth in the view of the splat at which the

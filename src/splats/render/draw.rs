@@ -13,6 +13,7 @@ use super::target::Target;
 use super::{DepthChannel, ProjectionKind, RenderOptions, Renderer};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, HostImage, ImageState, Pipeline, Recorder, Ring, Threads};
+use crate::kernels::blend_forward::{DEPTH_MEDIAN, DEPTH_SUM};
 use crate::kernels::status::STATUS_WORDS;
 use crate::kernels::{depth_limits, pack_pixels, photograph_light};
 use crate::splats::camera::model_number;
@@ -317,7 +318,10 @@ impl Renderer {
             self.record_limits(pass, &image, scene.limits(camera), size)?;
         }
         let depths = target.needs_depths().then_some(DepthChannel {
-            takes_median: target.depth_kind == super::DepthKind::Median,
+            kind: match target.depth_kind {
+                super::DepthKind::Median => DEPTH_MEDIAN,
+                super::DepthKind::Expected => DEPTH_SUM,
+            },
             has_limits: target.scene.is_some(),
         });
         let capacity = self.drawn_capacity(target);

@@ -81,7 +81,7 @@ impl LampBackward {
         let [tile_width, tile_height] = tile.size;
         let constants = lamp_backward::Constants {
             alpha_max: settings.max_alpha,
-            channels: settings.channels() as u32,
+            channels: settings.trained_channels() as u32,
             tile_width,
             tile_height,
             frozen_columns,
@@ -140,7 +140,7 @@ impl Renderer {
         view: &KernelView<'_>,
         gradients: &Buffer<f32>,
     ) -> Result<()> {
-        let (first, channels) = (self.context_count(), self.settings.channels());
+        let (first, channels) = (self.context_count(), self.settings.trained_channels());
         let Self { gpu, frame, lamp, gradients: written, .. } = self;
         let Some(DeviceLamp { numbers, gradients: to, backward: Some(kernels), .. }) = lamp else {
             return Ok(());

@@ -52,7 +52,7 @@ impl RenderSettings {
     /// which one binding has to hold. Other planes are bound in [`Batches`](crate::splats::batches::Batches).
     #[doc(hidden)]
     pub fn peak_gaussians(&self, gpu: &Gpu) -> usize {
-        let color = color_floats(self.channels()) * size_of::<f32>();
+        let color = color_floats(self.trained_channels()) * size_of::<f32>();
         let bytes = size_of::<ProjectedSplat>().max(color) as u64;
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
     }
@@ -91,7 +91,7 @@ impl RenderSettings {
     pub fn check_size(&self, gpu: &Gpu, view: &str, [width, height]: [u32; 2]) -> Result<()> {
         let Properties { name: device, max_storage_buffer_range: bindable, .. } = gpu.properties();
         let [tile_width, tile_height] = self.tile_for(gpu, std::iter::once([width, height]))?.size;
-        let bytes_per_pixel = (self.channels() * size_of::<f32>()) as u64;
+        let bytes_per_pixel = (self.trained_channels() * size_of::<f32>()) as u64;
         let bytes = u64::from(width) * u64::from(height) * bytes_per_pixel;
         let tiles = u64::from(width.div_ceil(tile_width)) * u64::from(height.div_ceil(tile_height));
         let most = max_tiles(gpu) as u64;

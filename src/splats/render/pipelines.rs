@@ -9,9 +9,9 @@ use super::buffers::{RANKS_PER_PARTITION, RenderBuffers, Segments};
 use super::lamp::DeviceLamp;
 use super::limits::{longest_run, segment_length, splats_per_turn, sums_in_shared_memory};
 use super::{Purpose, RenderSettings, Renderer, Sort};
-use crate::Result;
 use crate::gpu::{Gpu, Pipeline, Sorting, Tile};
 use crate::kernels::camera::CAMERA_ORTHOGRAPHIC;
+use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
     blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
@@ -20,6 +20,7 @@ use crate::splats::camera::model_number;
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::Shape;
+use crate::{Error, Result};
 
 impl Renderer {
     /// Builds the kernels; [`Renderer::reserve`] allocates.
@@ -45,7 +46,7 @@ impl Renderer {
         let segment = segment_length(gpu.properties(), settings.purpose, tile);
         let gradients = WrittenGradients { kind: gradients, frozen_columns };
         let mut renderer = Self::build(gpu, settings, gradients, tile, segment)?;
-        renderer.build_backward(ProjectionKind::pinhole())?;
+        renderer.build_backward(ProjectionKind::pinhole(&renderer.settings))?;
         Ok(renderer)
     }
 
@@ -63,9 +64,16 @@ impl Renderer {
         segment: u32,
     ) -> Result<Self> {
         let [tile_width, tile_height] = tile.size;
-        let channels = settings.channels() as u32;
+        let channels = settings.trained_channels() as u32;
+        if channels > MAX_CHANNELS {
+            let problem = format!(
+                "a pixel would have {channels} values, and has {MAX_CHANNELS} at most; train normals without \
+                 the denoiser of the paper's variant, or without another part"
+            );
+            return Err(Error::Usage(problem));
+        }
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
-        let pinhole = ProjectionKind::pinhole();
+        let pinhole = ProjectionKind::pinhole(&settings);
         let lamp = settings.lamp.map(|lamp| DeviceLamp::new(gpu, settings.purpose, &lamp));
         let projections = Projections::new(gpu, &settings, tile, pinhole)?;
         let state = tile_width * tile_height * (channels + 1);
@@ -88,10 +96,13 @@ impl Renderer {
                 sorts_tiles: sorting == Sorting::Tiles,
             })?,
             blend_forward: blending(gpu, &settings, tile, segment, false)?,
-            blend_depths: None,
+            blend_depths: settings
+                .keeps_depth()
+                .then(|| blending(gpu, &settings, tile, segment, true))
+                .transpose()?,
             blend_backward: None,
             sort: Sort::new(gpu, sorting)?,
-            frame: RenderBuffers::new(gpu, settings.channels(), settings.purpose, segments)?,
+            frame: RenderBuffers::new(gpu, channels as usize, settings.purpose, segments)?,
             limits: gpu.uninit("limits", 1)?,
             host_targets: None,
             picks: None,
@@ -195,10 +206,11 @@ pub(super) struct ProjectionKind {
 }
 
 impl ProjectionKind {
-    /// Of a pinhole camera and a model without transform.
-    fn pinhole() -> Self {
+    /// Of a pinhole camera and a model without transform, in training.
+    fn pinhole(settings: &RenderSettings) -> Self {
         let camera_model = model_number(&CameraModel::Pinhole);
-        Self { camera_model, view_depths: false, instances: None, shares_sort: false }
+        let view_depths = settings.keeps_depth();
+        Self { camera_model, view_depths, instances: None, shares_sort: false }
     }
 }
 
@@ -239,6 +251,7 @@ macro_rules! projection {
             half_rest: rest == StorageFormat::Half,
             rest_by_column: rest_by_column(gpu),
             camera_model: kind.camera_model,
+            view_depths: u32::from(kind.view_depths),
             $($extra: $value,)*
         })
     }};
@@ -247,7 +260,6 @@ macro_rules! projection {
 impl Projections {
     fn new(gpu: &Gpu, settings: &RenderSettings, tile: Tile, kind: ProjectionKind) -> Result<Self> {
         let forward = projection!(project, gpu, settings, tile, kind, {
-            view_depths: u32::from(kind.view_depths),
             instances: kind.instances.is_some(),
             shares_sort: kind.shares_sort
         });
@@ -298,10 +310,11 @@ fn blending_backward(
 ) -> Result<Pipeline<blend_backward::Kernel>> {
     gpu.pipeline(&blend_backward::Constants {
         alpha_max: settings.max_alpha,
-        channels: settings.channels() as u32,
+        channels: settings.trained_channels() as u32,
         tile_width,
         tile_height,
         shaping_channels: settings.shaping_channels(),
+        view_depths: settings.keeps_depth().into(),
         skips_groups: !gpu.properties().is_cpu,
         splats_per_turn: splats_per_turn(gpu),
         sums_in_shared_memory: sums_in_shared_memory(gpu.properties()),

@@ -35,6 +35,11 @@ pub struct RenderSettings {
     pub detach_geometry: bool,
     /// What the renderer is for.
     pub purpose: Purpose,
+    /// The mean depth of each pixel is trained, too: [`Renderer::forward`](crate::splats::render::Renderer::forward)
+    /// keeps it as the last channel, and [`backward`](crate::splats::render::Renderer::backward) takes its gradient
+    /// over alpha. Without effect where the purpose is to show.
+    #[doc(hidden)]
+    pub trains_depth: bool,
     /// The tile of a workgroup; `None`: the fastest on the device.
     pub tile: Option<Tile>,
     /// The most pixels that are rendered at once; `None`: as many as the device can bind.
@@ -66,6 +71,7 @@ impl Default for RenderSettings {
             rest: StorageFormat::Single,
             detach_geometry: false,
             purpose: Purpose::Train,
+            trains_depth: false,
             tile: None,
             patch_pixels: None,
             sorting: None,
@@ -146,6 +152,16 @@ impl RenderSettings {
     #[doc(hidden)]
     pub fn channels(&self) -> usize {
         self.shape.features.channels()
+    }
+
+    /// Whether the last channel of a training render is the depth.
+    pub(super) fn keeps_depth(&self) -> bool {
+        self.trains_depth && self.purpose == Purpose::Train
+    }
+
+    /// Values per pixel of a training render: [`Self::channels`], and the depth if that is trained.
+    pub(crate) fn trained_channels(&self) -> usize {
+        self.channels() + usize::from(self.keeps_depth())
     }
 
     /// The leading channels whose gradients reach the geometry.

@@ -50,12 +50,14 @@ fn picks_and_motion_of_instances_agree_with_their_references_and_with_the_depth_
         let on_device = solid.upload(gpu).unwrap();
         let instances = instances(&on_device);
         let mut renderer = Renderer::new(gpu, show_settings()).unwrap();
-        let wall = scene(host, ImageFormat::D32Float, |_| 0).unwrap();
-        let lent = wall.lent(ImageState::DEPTH_ATTACHMENT, ImageState::DEPTH_ATTACHMENT);
-        for (is_orthographic, format) in [
-            (false, ImageFormat::Rg32Float),
-            (true, ImageFormat::Rg32Float),
-            (false, ImageFormat::Rg16Float),
+        let picture = scene(host, ImageFormat::D32Float, |_| 0).unwrap();
+        let lent = picture.lent(ImageState::DEPTH_ATTACHMENT, ImageState::DEPTH_ATTACHMENT);
+        let convention = DepthConvention::Reversed { near: 0.1, far: Some(50.0) };
+        let wall = SceneDepth { image: &lent, convention };
+        for (is_orthographic, format, scene) in [
+            (false, ImageFormat::Rg16Float, None),
+            (false, ImageFormat::Rg32Float, Some(wall)),
+            (true, ImageFormat::Rg32Float, Some(wall)),
         ] {
             let cameras = views(is_orthographic);
             let turn = DAffine3::from_rotation_y(0.02);
@@ -68,11 +70,10 @@ fn picks_and_motion_of_instances_agree_with_their_references_and_with_the_depth_
             let depth = host.picture(ImageFormat::R32Float, SIZE).unwrap();
             let [motion_image, depth_image]: [HostImage; 2] = [&motion, &depth]
                 .map(|picture| picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE));
-            let convention = DepthConvention::Reversed { near: 0.1, far: Some(50.0) };
             let pixel = [30, 22];
             let target = Target {
                 depth: Some(&depth_image),
-                scene: Some(SceneDepth { image: &lent, convention }),
+                scene,
                 motion: Some(Motion { image: &motion_image, before: &before }),
                 pick: Some(pixel),
                 ..Target::default()
@@ -103,7 +104,7 @@ fn picks_and_motion_of_instances_agree_with_their_references_and_with_the_depth_
             }
             [motion, depth].into_iter().for_each(|picture| host.free_picture(picture));
         }
-        host.free_picture(wall);
+        host.free_picture(picture);
     });
 }
 

@@ -91,5 +91,6 @@ fn pixels(view: &View) -> Result<u64> {
     for numbers in image.iter().map(|image| &image.data).chain(&view.depth) {
         hasher.write(bytemuck::cast_slice(numbers));
     }
+    view.normals.iter().for_each(|map| hasher.write(bytemuck::cast_slice(map.packed())));
     Ok(hasher.finish())
 }

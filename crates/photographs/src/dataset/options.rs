@@ -7,6 +7,7 @@ use nightsplat_core::settings::Rule;
 use nightsplat_core::{Error, Result};
 
 use super::PixelOrientation;
+use super::normals::NormalAxes;
 use super::shading::RowBands;
 use crate::image::{StoredLight, reduced_size};
 use crate::tree;
@@ -65,6 +66,8 @@ pub struct LoadOptions {
     pub undistort: bool,
     /// Depth maps of the training views.
     pub depth: DepthOptions,
+    /// Normal maps of the training views.
+    pub normals: NormalOptions,
 }
 
 /// The size at which a curve is applied to photographs, and at which these are measured for it.
@@ -88,6 +91,17 @@ pub struct DepthOptions {
     pub folder: Option<PathBuf>,
     /// The maps are disparity, in which larger is nearer; they are negated.
     pub is_disparity: bool,
+}
+
+/// The location of normal maps: `STEM.*` or `normal_STEM.*` in a folder.
+#[derive(Clone, Debug, Default)]
+pub struct NormalOptions {
+    /// Whether normal maps are loaded.
+    pub load: bool,
+    /// The folder; `None`: `normals/` or `normal_maps/` of the dataset.
+    pub folder: Option<PathBuf>,
+    /// The axes of their vectors.
+    pub axes: NormalAxes,
 }
 
 impl Default for LoadOptions {
@@ -114,6 +128,7 @@ impl Default for LoadOptions {
             measured: MeasuredSize::default(),
             undistort: false,
             depth: DepthOptions::default(),
+            normals: NormalOptions::default(),
         }
     }
 }
@@ -167,6 +182,7 @@ impl LoadOptions {
             (&self.reference, "reference images"),
             (&self.targets, "targets"),
             (&self.depth.folder, "depth maps"),
+            (&self.normals.folder, "normal maps"),
         ];
         for (folder, of) in folders {
             if let Some(folder) = folder.as_ref().filter(|folder| !tree::is_dir(folder)) {

@@ -26,6 +26,7 @@ pub(super) struct ViewFiles {
     pub(super) target: Option<PathBuf>,
     pub(super) mask: Option<MaskFile>,
     pub(super) depth: Option<PathBuf>,
+    pub(super) normals: Option<PathBuf>,
     /// Photograph and reference image, if they are already read.
     pub(super) read: [Option<Arc<PictureFile>>; 2],
     /// The sizes that these are decoded at, once their headers are read.

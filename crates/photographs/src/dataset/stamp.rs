@@ -8,6 +8,7 @@ use nightsplat_core::hash::{self, Hasher};
 use super::layout::DatasetLayout;
 use super::listed::Listing;
 use super::listing::select;
+use super::source::ViewFiles;
 use super::{Dataset, LoadOptions, sources};
 use crate::image::files::PhotographFiles;
 use crate::tree;
@@ -33,8 +34,9 @@ impl Dataset {
             let view = format!("{} {:?} {:?}", source.name, source.split, source.lens);
             hasher.write(view.as_bytes());
             hasher.write_numbers(&source.view_from_world.to_cols_array());
-            let mask = source.mask.map(|mask| mask.path);
-            for file in [&source.input, &source.reference, &source.target, &mask, &source.depth] {
+            let mask = source.mask.as_ref().map(|mask| mask.path.clone());
+            let ViewFiles { input, reference, target, depth, normals, .. } = &source;
+            for file in [input, reference, target, &mask, depth, normals] {
                 file.iter().for_each(|path| write_file(&mut hasher, root, path));
             }
         }

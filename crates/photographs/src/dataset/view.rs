@@ -6,7 +6,7 @@ use glam::UVec2;
 use nightsplat_core::Result;
 use nightsplat_core::camera::Camera;
 
-use super::Original;
+use super::{NormalMap, Original};
 use crate::image::{Image, Mask, Orientation};
 
 /// A photograph's place in the dataset.
@@ -41,6 +41,8 @@ pub struct View {
     /// An external depth map, (H, W) of the camera's size, in arbitrary units and with an arbitrary offset; larger is
     /// farther. Only for training views, and `None` if it is constant.
     pub depth: Option<Vec<f32>>,
+    /// External normals, of the camera's size. Only for training views of a pinhole, and `None` if no pixel has one.
+    pub normals: Option<NormalMap>,
 }
 
 impl View {
@@ -59,6 +61,7 @@ impl View {
             target_file: None,
             mask: None,
             depth: None,
+            normals: None,
         }
     }
 

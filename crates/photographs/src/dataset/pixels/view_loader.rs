@@ -16,7 +16,7 @@ use crate::dataset::prepare::{Preparation, check_size};
 use crate::dataset::shading::Shading;
 use crate::dataset::source::ViewFiles;
 use crate::dataset::turns::Turns;
-use crate::dataset::{MeasuredSize, Split, View};
+use crate::dataset::{MeasuredSize, NormalMap, Split, View};
 use crate::image::{ColourCounts, Image, Mask, MaskFile, Orientation, PictureFile};
 use crate::tone::MeasuredPhotograph;
 
@@ -67,6 +67,7 @@ impl ViewLoader<'_> {
             target,
             mask: mask_file,
             depth,
+            normals,
             read,
             turns,
             size,
@@ -133,11 +134,17 @@ impl ViewLoader<'_> {
         let depth = depth.and_then(|path| {
             depth_map(&path, preparation, options.depth.is_disparity).map_err(unused).ok()
         });
+        let normals = normals.and_then(|path| {
+            let unused = |problem| {
+                tracing::warn!("the normals of view {name} are not used: {problem}");
+            };
+            NormalMap::load(&path, preparation, options.normals.axes).map_err(unused).ok()
+        });
         let view = View::new(&name, split, Camera { view_from_world, ..*camera }, image);
         let unit = colours.levels().unit();
         let view =
             View { orientation, original, unit, reference, reference_file, mask, depth, ..view };
-        let view = View { target_file, ..view };
+        let view = View { target_file, normals, ..view };
         let view = (split == Split::Test || view.has_photograph()).then_some(view);
         Ok(LoadedView { name, view, problems, brightness, reference: reference_original })
     }
