@@ -11,6 +11,7 @@ use super::scene::BenchScene;
 use super::{Bench, median, stages, total};
 use crate::Result;
 use crate::gpu::{Buffer, Resources, Sorting, Tile, TunedTile};
+use crate::splats::batches::GradientKind;
 use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
 use crate::splats::scene::{DeviceGaussians, Features, Layout, MAX_SH_DEGREE};
 
@@ -134,7 +135,7 @@ impl Case {
         let compiled = choices.into_par_iter().map(|(tile, sorting)| {
             let defaults = scene.render_settings();
             let settings = RenderSettings { tile: Some(tile), sorting: Some(sorting), ..defaults };
-            let renderer = Renderer::new(gpu, settings)?;
+            let renderer = Renderer::with_gradients(gpu, settings, GradientKind::All, 0)?;
             let resources = renderer.blend_statistics()?;
             let resources = resources
                 .map(|all| all.each_ref().map(|kernel| Resources::from_statistics(kernel)));

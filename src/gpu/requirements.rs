@@ -173,7 +173,7 @@ mod tests {
     #[test]
     fn each_missing_requirement_is_the_one_that_is_named() {
         type Break = (&'static str, fn(&mut Supported));
-        let breaks: [Break; 12] = [
+        let breaks: [Break; 13] = [
             ("Vulkan 1.3", |o| o.properties.api_version = vk::API_VERSION_1_2),
             ("compute queue", |o| o.compute_family = None),
             ("maxPerStageDescriptorStorageBuffers >= 12", |o| {

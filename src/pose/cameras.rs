@@ -97,15 +97,16 @@ pub(super) fn unsupported(seen: &[(String, usize)]) -> Option<String> {
     let mut counts: Vec<usize> = seen.iter().map(|(_, count)| *count).collect();
     counts.sort_unstable();
     let median = *counts.get(counts.len() / 2)?;
-    let is_few = |count: usize| count < ENOUGH && (count as f64) < SHARE * median as f64;
-    let few: Vec<String> = seen
+    let is_weak = |count: usize| count < ENOUGH && (count as f64) < SHARE * median as f64;
+    let weak: Vec<String> = seen
         .iter()
-        .filter(|(_, count)| is_few(*count))
+        .filter(|(_, count)| is_weak(*count))
         .map(|(name, count)| format!("{name} ({count})"))
         .collect();
-    let (first, more) = (few[..few.len().min(NAMED)].join(", "), few.len().saturating_sub(NAMED));
+    let (first, more) =
+        (weak[..weak.len().min(NAMED)].join(", "), weak.len().saturating_sub(NAMED));
     let named = if more > 0 { format!("{first} and {more} more") } else { first };
-    (!few.is_empty()).then(|| {
+    (!weak.is_empty()).then(|| {
         format!(
             "few points hold these cameras, which may be wrong: {named}; half of all photographs see {median}. Look at \
              them with `nightsplat view`, and leave wrong ones out with `train --exclude NAME`"

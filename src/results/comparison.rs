@@ -251,8 +251,12 @@ impl RunComparison {
         let mut keys: Vec<&String> = all.iter().flat_map(|settings| settings.keys()).collect();
         keys.sort();
         keys.dedup();
-        let differs =
-            |key: &&String| all.iter().any(|settings| settings.get(*key) != first.get(*key));
+        let differs = |key: &&String| {
+            all.iter().any(|settings| match (settings.get(*key), first.get(*key)) {
+                (Some(one), Some(other)) => !are_alike(one, other),
+                (one, other) => one.is_some() != other.is_some(),
+            })
+        };
         let text = |key: &String| {
             let value = |settings: &std::collections::BTreeMap<String, toml::Value>| {
                 settings.get(key).map_or_else(|| "none".to_owned(), ToString::to_string)
@@ -348,6 +352,21 @@ fn names(paths: &[PathBuf]) -> Vec<String> {
     paths.iter().zip(&all).map(name).collect()
 }
 
+/// Whether two settings are the same to rounding: a direction is normalised anew for each run.
+fn are_alike(one: &toml::Value, other: &toml::Value) -> bool {
+    match (one, other) {
+        (toml::Value::Float(one), toml::Value::Float(other)) => {
+            let largest = one.abs().max(other.abs());
+            one == other || largest < 1e-15 || (one - other).abs() < 1e-12 * largest
+        }
+        (toml::Value::Array(one), toml::Value::Array(other)) => {
+            one.len() == other.len()
+                && one.iter().zip(other).all(|(one, other)| are_alike(one, other))
+        }
+        _ => one == other,
+    }
+}
+
 /// In what the test views of two datasets differ, in words.
 fn difference(one: &Dataset, other: &Dataset) -> Option<String> {
     let views = |dataset: &Dataset| {
@@ -372,4 +391,18 @@ fn difference(one: &Dataset, other: &Dataset) -> Option<String> {
         }
     }
     None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_that_differ_by_rounding_are_alike() {
+        let up = |x: f64| toml::Value::from(vec![x, -1.0, 0.0]);
+        assert!(are_alike(&up(0.0), &up(1e-17)) && !are_alike(&up(0.0), &up(1e-9)));
+        let rate = |x: f64| toml::Value::from(x);
+        assert!(are_alike(&rate(1e-13), &rate(1e-13)) && !are_alike(&rate(1e-13), &rate(2e-13)));
+        assert!(!are_alike(&rate(f64::NAN), &rate(1.0)) && !are_alike(&rate(1.0), &"1".into()));
+    }
 }
