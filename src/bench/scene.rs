@@ -12,6 +12,7 @@ use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
 use crate::Result;
 use crate::gpu::{CheckReport, Gpu};
 use crate::results::{models, run};
+use crate::splats::batches::GradientKind;
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer, Status};
 use crate::splats::scene::{Features, Gaussians, MAX_SH_DEGREE, SH_C0, Shape};
@@ -186,10 +187,12 @@ fn lita(gpu: &Gpu, precision: &PrecisionConfig) -> Result<Trainer> {
     Trainer::new(gpu, config, &BenchScene::new(96, 72, 500).dataset())
 }
 
-/// The number of splat-tile intersections.
+/// The number of splat-tile intersections. The renderer has the backward kernels of edits, so that compilers of GPUs are
+/// tried on them.
 fn intersections(gpu: &Gpu, scene: &BenchScene) -> Result<u32> {
     let BenchScene { camera, gaussians, .. } = scene;
-    let mut renderer = Renderer::new(gpu, scene.render_settings())?;
+    let settings = scene.render_settings();
+    let mut renderer = Renderer::with_gradients(gpu, settings, GradientKind::All, 0)?;
     renderer.reserve(gaussians.count, [camera])?;
     let parameters = gaussians.upload(gpu)?;
     let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };

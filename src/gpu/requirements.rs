@@ -191,7 +191,7 @@ mod tests {
                 o.features.subgroup_size_control.compute_full_subgroups = vk::FALSE;
             }),
             ("an instance of Vulkan 1.1", |o| {
-                o.subgroup_operations = vk::SubgroupFeatureFlags::empty()
+                o.subgroup_operations = vk::SubgroupFeatureFlags::empty();
             }),
             ("subgroup operations", |o| o.subgroup_operations = vk::SubgroupFeatureFlags::BASIC),
             ("subgroup size", |o| o.subgroups.default = 2),

@@ -90,7 +90,7 @@ pub struct SyntheticOptions {
     pub lamp: Option<f64>,
     /// What the scene has at night; not with `lamp`.
     pub night: Night,
-    /// Write the normal map of every training view, in 16 bits and OpenCV's axes, to `normals/`.
+    /// Write the normal map of every training view, in 16 bits, with x right, y down and z forward, to `normals/`.
     pub normals: bool,
 }
 
