@@ -205,7 +205,10 @@ pub use splats::scene::{DeviceGaussians, Features, GaussianSlice, Gaussians, Lay
 #[cfg(feature = "train")]
 #[doc(inline)]
 pub use nightsplat_photographs::{
-    dataset::{Dataset, DepthOptions, LoadOptions, Original, Point, RowBands, Split, View},
+    dataset::{
+        Dataset, DepthOptions, LoadOptions, NormalAxes, NormalMap, NormalOptions, Original, Point,
+        RowBands, Split, View,
+    },
     image::{ImageFile, Mask, Orientation},
     metrics::Scores,
     tone::{Expression, Profile, Table, Tone, ToneCurve, ToneSettings},
