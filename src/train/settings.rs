@@ -144,9 +144,10 @@ mod tests {
 
     /// A configuration with every optional setting.
     fn whole() -> TrainConfig {
-        let set = ["images", "reference", "init", "exposure.start", "model.depth_folder"]
-            .map(|key| format!("{key}=a"));
-        let mut set = set.to_vec();
+        let files = ["images", "reference", "init", "exposure.start"];
+        let folders = ["model.depth_folder", "model.normal_folder"];
+        let mut set: Vec<String> =
+            files.iter().chain(&folders).map(|key| format!("{key}=a")).collect();
         set.extend(["cache", "max_vram", "max_ram"].map(|key| format!("{key}=1G")));
         let rest = [
             "freeze=means",
