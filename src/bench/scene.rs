@@ -187,8 +187,8 @@ fn lita(gpu: &Gpu, precision: &PrecisionConfig) -> Result<Trainer> {
     Trainer::new(gpu, config, &BenchScene::new(96, 72, 500).dataset())
 }
 
-/// The number of splat-tile intersections. The renderer has the backward kernels of edits, so that compilers of GPUs are
-/// tried on them.
+/// The number of splat-tile intersections. The renderer has the backward kernels of edits, so that compilers of GPUs
+/// are tried on them.
 fn intersections(gpu: &Gpu, scene: &BenchScene) -> Result<u32> {
     let BenchScene { camera, gaussians, .. } = scene;
     let settings = scene.render_settings();
