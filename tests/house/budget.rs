@@ -25,7 +25,7 @@ const BUDGET: &[(&str, usize, &str)] = &[
     ("crates/fit", 1825, "Curves and profiles from pairs of photographs."),
     (
         "crates/photographs",
-        15980,
+        15990,
         "Images, datasets, tone curves, formulas too, normal maps, and what is measured of photographs.",
     ),
     ("crates/python", 1650, "The Python package, its types and tests, orthographic cameras too."),

@@ -178,15 +178,20 @@ mod tests {
 
     #[test]
     fn opengl_s_axes_are_told_from_opencv_s_by_what_faces_the_camera() {
-        let flipped = FACING * Vec3::new(1.0, -1.0, -1.0);
-        let encoded = |normal: Vec3| image_of(1, 1, std::iter::once(0.5 * normal + 0.5));
-        let signed = |normal: Vec3| image_of(1, 1, std::iter::once(normal));
-        for stored in [encoded(FACING), encoded(flipped), signed(FACING), signed(flipped)] {
+        let flip = Vec3::new(1.0, -1.0, -1.0);
+        // Of a signed map some number is negative, in either axes.
+        let facing = [FACING, Vec3::new(-0.6, 0.0, -0.8)];
+        let encoded =
+            |flip: Vec3| image_of(2, 1, facing.into_iter().map(move |n| 0.5 * flip * n + 0.5));
+        let signed = |flip: Vec3| image_of(2, 1, facing.into_iter().map(move |n| flip * n));
+        for stored in [encoded(Vec3::ONE), encoded(flip), signed(Vec3::ONE), signed(flip)] {
             let found = only(&NormalMap::of_means(&in_view_axes(stored, NormalAxes::Auto)));
-            assert!(found[0].angle_between(FACING).to_degrees() < 0.1, "{found:?}");
+            for (found, facing) in found.iter().zip(facing) {
+                assert!(found.angle_between(facing).to_degrees() < 0.1, "{found:?}");
+            }
         }
-        let chosen = in_view_axes(encoded(flipped), NormalAxes::OpenCv);
-        assert!(only(&NormalMap::of_means(&chosen))[0].angle_between(flipped) < 0.01);
+        let chosen = in_view_axes(encoded(flip), NormalAxes::OpenCv);
+        assert!(only(&NormalMap::of_means(&chosen))[0].angle_between(flip * FACING) < 0.01);
     }
 
     #[test]
