@@ -3,7 +3,7 @@
 use glam::{UVec2, Vec2};
 use nightsplat_photographs::tone::Real;
 
-use super::rounding::{Rounded, chain, sum_tolerance, write_sum};
+use super::rounding::{Rounded, chain, sum_tolerance, write, write_sum};
 use crate::gpu::Reference;
 use crate::kernels::map_normal::NO_NORMAL;
 use crate::kernels::normals::{Constants, Kernel, MOST_TRANSMITTANCE, Params, Slices, Tolerances};
@@ -98,7 +98,7 @@ impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let (values, gradients): (Vec<_>, Vec<_>) = losses(params, &slices).unzip();
         let numbers = gradients.into_iter().flat_map(stored);
-        super::rounding::write(numbers, slices.d_differences);
+        write(numbers, slices.d_differences);
         write_sum(values.into_iter().map(|value| value.value), slices.partials);
     }
 

@@ -373,12 +373,12 @@ impl TrainConfig {
         let ModelConfig { depth, normals, .. } = &mut self.model;
         let depth_maps = dataset.train_views().filter(|view| view.depth.is_some()).count();
         let normal_maps = dataset.train_views().filter(|view| view.normals.is_some()).count();
-        for (part, name, count) in [(depth, "depth", depth_maps), (normals, "normals", normal_maps)]
-        {
-            let map = name.trim_end_matches('s');
+        let parts =
+            [(depth, "depth", "depth", depth_maps), (normals, "normals", "normal", normal_maps)];
+        for (part, folder, map, count) in parts {
             if *part && count == 0 {
                 tracing::warn!(
-                    "no view has a {map} map ({name}/NAME.png, or in model.{map}_folder): no {map} term"
+                    "no view has a {map} map ({folder}/NAME.png, or in model.{map}_folder): no {map} term"
                 );
                 *part = false;
             } else if *part {

@@ -45,10 +45,13 @@ impl ExportOptions<'_> {
         let roundings = if self.format == Format::Html { &ROUNDINGS[..] } else { &ROUNDINGS[..1] };
         for degree in (1..=all).rev() {
             for &multiple in roundings {
-                let (fuller, kept) = (rounded(&model, degree, multiple), multiple.recip());
+                let fuller = rounded(&model, degree, multiple);
                 if fits(&fuller)? {
-                    let multiples = format!(" in multiples of 1/{kept}");
-                    let multiples = if multiple > 0.0 { multiples } else { String::new() };
+                    let multiples = if multiple > 0.0 {
+                        format!(" in multiples of 1/{}", multiple.recip())
+                    } else {
+                        String::new()
+                    };
                     let what = format!("; SH degree {degree} of {all}{multiples}, level {level}");
                     return Ok((fuller, what));
                 }
