@@ -327,8 +327,8 @@ fn with_wrong_param(gpu: &Gpu, kernel: &'static str, word: usize, bits: u32) -> 
 #[test]
 fn a_wrong_parameter_is_reported_at_the_pass_that_uses_it() {
     let gpu = as_a_cpu();
-    // The near plane, the background, the scale of L1, Adam's rate for the means. What a kernel leaves unwritten may hold
-    // the right values of an earlier run: the outputs are written, and wrong.
+    // The near plane, the background, the scale of L1, Adam's rate for the means. What a kernel leaves unwritten may
+    // hold the right values of an earlier run: the outputs are written, and wrong.
     for (kernel, word, bits, buffer) in [
         ("project", 1, 0x4000_0000, "splats"),
         ("blend_forward", 4, 0x3f80_0000, "render"),
