@@ -14,7 +14,8 @@ impl PseudoGt {
         let Image { width, height, .. } = *photograph;
         let pixels = photograph.pixel_count();
         let (mut data, mut first) = (vec![0.0; photograph.data.len()], 0);
-        for tile in self.tiles(&photograph.data)? {
+        while first < pixels {
+            let tile = self.tile(&photograph.data, first)?;
             let mut mapped = self.gpu.uninit("pseudo-GT", tile.len())?;
             let mut download = None;
             self.gpu.run("pseudo-GT", |pass| {
@@ -32,19 +33,15 @@ impl PseudoGt {
         Ok(Image { width, height, data })
     }
 
-    /// Runs of pixels, each planar (3, count), that the device can bind.
-    fn tiles(&self, planes: &[f32]) -> Result<Vec<Buffer<f32>>> {
+    /// The run of pixels from `first`, planar (3, count), as long as the device can bind.
+    fn tile(&self, planes: &[f32], first: usize) -> Result<Buffer<f32>> {
+        /// Small tiles reuse one another's memory.
+        const MOST: usize = 1 << 20;
         let pixels = planes.len() / 3;
         let bytes_per_pixel = 3 * size_of::<f32>() as u64;
-        let most = (self.gpu.properties().max_storage_buffer_range / bytes_per_pixel) as usize;
-        if pixels <= most {
-            return Ok(vec![self.gpu.buffer("photograph", planes)?]);
-        }
-        let tile = |first: usize| {
-            let count = most.min(pixels - first);
-            let plane = |plane: usize| &planes[plane * pixels + first..][..count];
-            self.gpu.buffer("photograph", &[plane(0), plane(1), plane(2)].concat())
-        };
-        (0..pixels).step_by(most).map(tile).collect()
+        let bindable = (self.gpu.properties().max_storage_buffer_range / bytes_per_pixel) as usize;
+        let count = bindable.min(MOST).min(pixels - first);
+        let planes = [0, 1, 2].map(|plane| &planes[plane * pixels + first..][..count]);
+        self.gpu.buffer("photograph", &planes.concat())
     }
 }

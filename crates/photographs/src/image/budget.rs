@@ -8,7 +8,7 @@ pub(super) const MAX_PIXELS: u64 = 1 << 28;
 /// A photograph of more pixels is reduced while it is decoded, to at most `REDUCED`, unless it is wanted larger.
 /// Cameras have 61 million; those of medium format 102 or 151.
 const LARGE: u64 = 1 << 26;
-const REDUCED: u64 = 1 << 23;
+const REDUCED: u64 = 1 << 22;
 
 /// Bytes that decoders may hold at a time in all threads, unless one alone needs more.
 const MOST_AT_ONCE: u64 = 1 << 30;
