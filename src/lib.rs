@@ -83,6 +83,7 @@
 //! * `nightsplat-core`: errors, files, settings, cameras, images in memory, formulas of tone curves
 //! * `nightsplat-photographs`: images, datasets, tone curves and what is measured of them, without a device
 //! * `nightsplat-fit`, `nightsplat-synth`: curves from pairs of photographs; synthetic datasets
+//! * `nightsplat-report`: pages with tables and charts, videos, event files
 //! * `nightsplat-capi`: the C interface, above this crate
 //!
 //! and in this crate a folder uses only folders above it in this list, as `tests/house/architecture.rs` asserts. The

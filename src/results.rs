@@ -6,8 +6,6 @@
 //! - [`run`]: a training run, its events and its directory
 //! - [`run_facts`]: the summary of a run before its first step
 //! - [`sweep`]: the results of a sweep
-//! - [`report`]: tables and plots in one self-contained page
-//! - [`colour_map`]: numbers as colours
 //! - [`comparison`]: runs on one dataset, view by view
 //! - [`diagnosis`]: a diagnosis of photographs as a table and a page
 //! - [`evaluation`]: scores as a table, and the page of a run
@@ -16,12 +14,10 @@
 //! - [`finished_run`]: a finished run or a model file, opened for rendering
 //! - [`view_exposures`]: renders at the exposure of their targets
 //! - [`verdict`]: a sentence on a set of photographs, and on a trained model
-//! - [`video`]: frames as a video
 //! - [`export`]: a model in other formats
 //! - [`run_export`]: the export of a run
 //! - [`edit`]: changes of a model
 
-pub mod colour_map;
 pub mod comparison;
 pub mod diagnosis;
 pub mod edit;
@@ -31,11 +27,9 @@ pub mod export;
 pub mod finished_run;
 pub mod linear_light;
 pub mod models;
-pub mod report;
 pub mod run;
 pub mod run_export;
 pub mod run_facts;
 pub mod sweep;
 pub mod verdict;
-pub mod video;
 pub mod view_exposures;

@@ -13,11 +13,9 @@ use super::words::NamedValues;
 use super::{OutputFormat, finish, opener, progress_bar, with_dataset};
 use crate::Error;
 use crate::gpu::DeviceChoice;
-use crate::results::colour_map;
 use crate::results::eval::RenderLayer;
 use crate::results::finished_run::FinishedRun;
 use crate::results::linear_light::{Clipped, STOPS, in_unit, photograph_of};
-use crate::results::video;
 use crate::results::view_exposures::ViewExposures;
 use nightsplat_core::camera::Easing;
 use nightsplat_core::output::{create_folder, one_line};
@@ -25,6 +23,8 @@ use nightsplat_photographs::dataset::{Dataset, Split, View};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tree::check_writable;
+use nightsplat_report::colour_map;
+use nightsplat_report::video;
 
 /// Render a run from the cameras of its dataset, or along a path through them.
 ///

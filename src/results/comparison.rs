@@ -7,11 +7,11 @@ use nightsplat_core::natural;
 use nightsplat_photographs::dataset::{Dataset, View, ViewPictures};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::metrics::Scores;
+use nightsplat_report::{Best, Column, Comparison, NumberTable, Picture, Report, TextTable};
 use serde_json::{Value, json};
 
 use super::eval::{After, Evaluation, Extras, Metric, ScoreReference, ScoredImages};
 use super::finished_run::{FinishedRun, Opener, is_model};
-use super::report::{Best, Column, Comparison, NumberTable, Picture, Report, TextTable};
 use super::run;
 use crate::gpu::Gpu;
 use crate::networks::lpips::{Lpips, LpipsVersion, Range};

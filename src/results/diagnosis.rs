@@ -4,11 +4,11 @@ use nightsplat_core::natural;
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::ToneSettings;
-
-use crate::results::linear_light::target_of;
-use crate::results::report::{
+use nightsplat_report::{
     Best, Column, ContactSheet, Distribution, NumberTable, Report, TextTable, distributions,
 };
+
+use crate::results::linear_light::target_of;
 use crate::results::verdict;
 use crate::train::diagnose::{
     ChannelNoise, Diagnosis, LampDiagnosis, Plan, SceneDiagnosis, TargetNoise, ViewDiagnosis,

@@ -7,13 +7,13 @@ use nightsplat_photographs::dataset::{View, ViewPictures};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::metrics::Scores;
 use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_report::{Chart, Comparison, Picture, Report, Series};
 use serde_json::Value;
 
 use super::eval::{
     self, After, Evaluation, Extras, Metric, ScoreReference, ScoredImages, with_reference,
 };
 use super::finished_run::{FinishedRun, Opener, is_model};
-use super::report::{Chart, Comparison, Picture, Report, Series};
 use super::{run, verdict};
 use crate::Result;
 use crate::networks::lpips::{Lpips, Range};

@@ -12,7 +12,6 @@ mod meter;
 mod progress;
 mod requests;
 mod tail;
-mod tensorboard;
 mod train;
 
 pub use directory::{RunDirectory, RunProgress, load_progress};

@@ -1,11 +1,11 @@
 //! The page is self-contained, escapes all text and highlights the best values.
 
 use crate::common::command::says;
-use nightsplat::results::report::{
+use nightsplat_photographs::image::Image;
+use nightsplat_report::{
     Best, Chart, Column, Comparison, Distribution, Mark, NumberTable, Picture, Report, Series,
     TextTable, distributions,
 };
-use nightsplat_photographs::image::Image;
 
 fn column(name: &str, digits: usize, best: Best) -> Column {
     Column { name: name.into(), digits, best }

@@ -17,6 +17,7 @@ use nightsplat_photographs::tone::{
     all_black,
 };
 use nightsplat_photographs::tree::check_writable;
+use nightsplat_report::Distribution;
 use serde::Serialize;
 
 use self::page::TonePage;
@@ -27,7 +28,6 @@ use crate::cli::{OutputFormat, finish, print, progress_bar, quoted, word, words}
 use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
-use crate::results::report::Distribution;
 use crate::targets::Targets;
 use crate::train::diagnose::remarks_at_points;
 use crate::train::{RequestedSettings, TrainConfig};

@@ -9,9 +9,9 @@ use nightsplat_photographs::image::{ColourCounts, Image, ImageFile};
 use nightsplat_photographs::tone::{
     CurveChoice, FAMILIES, Family, Statistics, Tone, ToneCurve, ToneSettings,
 };
+use nightsplat_report::{Chart, Series, VerticalLine};
 
 use crate::cli::{finish, print, words};
-use crate::results::report::{Chart, Series, VerticalLine};
 use crate::{Error, Result};
 
 /// List the tone curves, print their values or plot them.

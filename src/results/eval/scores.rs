@@ -3,11 +3,11 @@
 use nightsplat_core::natural;
 use nightsplat_photographs::metrics::Scores;
 use nightsplat_photographs::tone::ToneSettings;
+use nightsplat_report::{Best, Column, NumberTable};
 use serde_json::{Map, Value, json};
 
 use super::ReferenceKind;
 use crate::networks::lpips::LpipsVersion;
-use crate::results::report::{Best, Column, NumberTable};
 
 /// What a score measures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

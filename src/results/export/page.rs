@@ -10,6 +10,7 @@ use glam::{DAffine3, DVec3};
 use half::f16;
 use nightsplat_core::camera::{Camera, CameraModel, CameraPath};
 use nightsplat_photographs::image::Image;
+use nightsplat_report::{base64, escape, jpeg};
 use serde_json::json;
 
 pub use self::sharing::Sharing;
@@ -17,7 +18,6 @@ use super::{GENERATOR, Provenance, gzip};
 use crate::kernels::camera_pinhole::JACOBIAN_MARGIN;
 use crate::kernels::lamp::{LAMP_FARTHEST, LAMP_KNEE, LAMP_LEFT, LAMP_NEAREST};
 use crate::kernels::splat::{ALPHA_MIN, DILATION};
-use crate::results::report::{base64, escape, jpeg};
 use crate::splats::lamp::Lamp;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Gaussians, ModelFacts};

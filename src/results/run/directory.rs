@@ -30,13 +30,13 @@ use nightsplat_core::csv;
 use nightsplat_core::lock::FolderLock;
 use nightsplat_core::output::{flush_to_disk, own_file, write_whole};
 use nightsplat_photographs::dataset::{Dataset, Split, View};
+use nightsplat_report::tensorboard::EventFile;
 
 use super::backup::{self, Backup};
 use super::files::*;
 use super::generations;
 use super::ledger;
 pub use super::progress::RunProgress;
-use super::tensorboard::EventFile;
 use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::loss::exposure::{Affine, table};

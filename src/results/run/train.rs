@@ -6,11 +6,11 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_report::tensorboard::EventFile;
 
 use super::directory::RunProgress;
 use super::files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE, TRAINED_WITH, trained_with};
 use super::meter::{ResourceMeter, ResourceUsage};
-use super::tensorboard::EventFile;
 use super::{Event, Requests, RunDirectory, RunSummary, done, generations, load};
 use crate::gpu::Gpu;
 use crate::results::eval::{self, Evaluation, Extras, ScoreReference, ScoredImages};

@@ -5,6 +5,7 @@ use nightsplat_core::natural;
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::tone::ToneCurve;
+use nightsplat_report::jpeg;
 
 use super::{ExportOptions, has_networks};
 use crate::Result;
@@ -13,7 +14,6 @@ use crate::results::eval::ModelRenderer;
 use crate::results::export::Provenance;
 use crate::results::export::page::{Bookmark, ModelPage, PageImage, Sharing, moved};
 use crate::results::finished_run::{FinishedRun, is_model};
-use crate::results::report::jpeg;
 use crate::results::run;
 use crate::splats::render::RenderSettings;
 use crate::targets::Targets;

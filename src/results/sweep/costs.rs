@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use nightsplat_core::output::write_whole;
+use nightsplat_report::{Chart, Mark, NumberTable, Report, Series};
 use serde_json::{Map, Value, json};
 
 use super::rows::{SweepResults, SweepRow};
 use super::run::FailedPoint;
 use super::table::{ColumnStatistic, KEYS, Quantity};
 use crate::Result;
-use crate::results::report::{Chart, Mark, NumberTable, Report, Series};
 use crate::results::run::{RunProgress, energy_counters};
 
 /// The files of the costs.

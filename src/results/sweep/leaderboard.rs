@@ -6,6 +6,7 @@ use nightsplat_core::output::write_whole;
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::metrics::Scores;
+use nightsplat_report::{Chart, Column, Comparison, Mark, NumberTable, Picture, Report, Series};
 
 use super::point::{ADAPTIVE, OFFSET};
 use super::rows::{SweepResults, SweepRow};
@@ -15,9 +16,6 @@ use super::table::{ColumnStatistic, CsvColumn, Quantity};
 use crate::Result;
 use crate::gpu::Gpu;
 use crate::results::eval::{AGAINST, WITH_REFERENCE};
-use crate::results::report::{
-    Chart, Column, Comparison, Mark, NumberTable, Picture, Report, Series,
-};
 
 /// The files of a leaderboard.
 pub const FILES: [&str; 3] = ["leaderboard.csv", "leaderboard.md", "index.html"];

@@ -5,12 +5,12 @@ use std::path::Path;
 
 use nightsplat_core::csv;
 use nightsplat_core::output::write_whole;
+use nightsplat_report::{Best, Chart, Mark, Report, Series, escape};
 
 use super::rows::{SweepResults, SweepRow, number};
 use super::table::Quantity;
 use crate::Result;
 use crate::networks::lpips::LpipsVersion;
-use crate::results::report::{Best, Chart, Mark, Report, Series, escape};
 
 /// The tables and the page, which a later sweep of the folder replaces.
 const FILES: [&str; 4] = ["scenes.md", "scenes.csv", "scenes.tex", "index.html"];

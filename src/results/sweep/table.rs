@@ -2,10 +2,10 @@
 //! of different columns.
 
 use nightsplat_core::csv;
+use nightsplat_report::{Best, Column, NumberTable};
 
 use super::rows::{SweepResults, SweepRow, number};
 use crate::networks::lpips::LpipsVersion;
-use crate::results::report::{Best, Column, NumberTable};
 
 /// A number in `metrics.json` of a run.
 #[derive(Clone, Debug)]

@@ -7,16 +7,16 @@ use nightsplat_core::output::write_whole;
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::metrics::Scores;
 use nightsplat_photographs::tone::Tone;
+use nightsplat_report::{
+    Best, Column, Comparison, ContactSheet, Distribution, NumberTable, Picture, Report,
+    distributions,
+};
 
 use super::photographs::InputPhotograph;
 use super::{ApplyArgs, CurveOnSet, Mapped, Measures, ToneOutput, ToneReport, without};
 use crate::Result;
 use crate::gpu::Gpu;
 use crate::results::eval;
-use crate::results::report::{
-    Best, Column, Comparison, ContactSheet, Distribution, NumberTable, Picture, Report,
-    distributions,
-};
 
 /// Maximum width of an image, pixels.
 const PICTURE_WIDTH: u32 = 480;

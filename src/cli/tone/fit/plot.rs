@@ -2,9 +2,9 @@
 
 use nightsplat_fit::{Channels, FitOptions, Histogram, Pair};
 use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat_report::{Chart, Series};
 
 use super::Fitted;
-use crate::results::report::{Chart, Series};
 
 /// Share of the pixels that the t axis covers.
 const SHARE: f64 = 0.995;

@@ -1,10 +1,10 @@
 //! What a page says of itself to those who open or link it: title, text, poster, and what its browser may do.
 
 use nightsplat_photographs::image::{Image, ImageFile};
+use nightsplat_report::{base64, escape, jpeg_of_quality};
 use sha2::{Digest, Sha256};
 
 use crate::Result;
-use crate::results::report::{base64, escape, jpeg_of_quality};
 
 /// The widths of a poster, pixels: beside the page, where services that show a link fetch it, and within the page.
 const POSTER_WIDTH: u32 = 1200;

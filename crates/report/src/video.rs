@@ -5,12 +5,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use nightsplat_core::output::write_whole;
+use nightsplat_core::{Error, Result};
 use nightsplat_photographs::image::{Image, ImageFile};
 
-use crate::{Error, Result};
-
 /// Makes a video of `files`.
-pub(crate) fn make(video: &Path, folder: &Path, files: &[PathBuf], fps: u16) -> Result<()> {
+pub fn make(video: &Path, folder: &Path, files: &[PathBuf], fps: u16) -> Result<()> {
     let extension = video.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     if ["png", "apng"].contains(&extension.as_str()) {
         return write_whole(video, &animated_png(files, fps)?);

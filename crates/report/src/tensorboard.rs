@@ -8,11 +8,11 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use crate::{Error, Result};
+use nightsplat_core::{Error, Result};
 
 /// A growing event file.
 #[derive(Debug)]
-pub(super) struct EventFile {
+pub struct EventFile {
     path: PathBuf,
     file: BufWriter<File>,
 }
@@ -20,7 +20,7 @@ pub(super) struct EventFile {
 impl EventFile {
     /// Creates a new file in `folder` for events after `step`. It invalidates later events of earlier files, from an
     /// interrupted run.
-    pub(super) fn create(folder: &Path, step: u64) -> Result<Self> {
+    pub fn create(folder: &Path, step: u64) -> Result<Self> {
         let failed = |error: std::io::Error| unwritable(folder, &error);
         std::fs::create_dir_all(folder).map_err(failed)?;
         // Readers order the files of a run by name.
@@ -41,7 +41,7 @@ impl EventFile {
     }
 
     /// Writes scalars of a step by name; a slash separates group and name.
-    pub(super) fn scalars(&mut self, step: u64, values: &[(String, f64)]) -> Result<()> {
+    pub fn scalars(&mut self, step: u64, values: &[(String, f64)]) -> Result<()> {
         let mut summary = Message::default();
         for (tag, value) in values {
             let value = Message::default().bytes(1, tag.as_bytes()).float(2, *value as f32);
@@ -51,7 +51,7 @@ impl EventFile {
     }
 
     /// Writes an image of a step, a PNG file.
-    pub(super) fn picture(
+    pub fn picture(
         &mut self,
         step: u64,
         tag: &str,
@@ -66,7 +66,7 @@ impl EventFile {
     }
 
     /// Writes a line of text of a step.
-    pub(super) fn text(&mut self, step: u64, tag: &str, text: &str) -> Result<()> {
+    pub fn text(&mut self, step: u64, tag: &str, text: &str) -> Result<()> {
         const DT_STRING: u64 = 7;
         let one = Message::default().message(2, &Message::default().varint(1, 1));
         let tensor = Message::default().varint(1, DT_STRING).message(2, &one);
@@ -78,7 +78,7 @@ impl EventFile {
     }
 
     /// Flushes the file for other readers.
-    pub(super) fn flush(&mut self) -> Result<()> {
+    pub fn flush(&mut self) -> Result<()> {
         self.file.flush().map_err(|error| unwritable(&self.path, &error))
     }
 

@@ -1,22 +1,30 @@
-//! A self-contained HTML page of a run: tables, charts and images, without external resources.
+//! What shows photographs, scores and runs, without Vulkan: a self-contained HTML page of tables, charts and images,
+//! without external resources, and other files. Part of `nightsplat`, whose API is what it exports of it.
+//!
+//! - [`colour_map`]: numbers as colours
+//! - [`tensorboard`]: event files for `TensorBoard`
+//! - [`video`]: frames as a video
 
 use std::fmt::Write as _;
 
 use nightsplat_photographs::image::Image;
 
 pub use self::chart::{Chart, Mark, Series, VerticalLine};
-pub(crate) use self::data_uri::{base64, jpeg, jpeg_of_quality};
+pub use self::data_uri::{base64, jpeg, jpeg_of_quality};
 pub use self::distribution::{Distribution, distributions};
 pub use self::sheet::ContactSheet;
 pub use self::table::{Best, Column, NumberTable};
 
 mod axis;
 mod chart;
+pub mod colour_map;
 mod data_uri;
 mod distribution;
 mod labels;
 mod sheet;
 mod table;
+pub mod tensorboard;
+pub mod video;
 
 /// A page. All text is escaped.
 #[derive(Clone, Debug, Default)]
@@ -72,7 +80,7 @@ pub struct Picture {
 
 impl Picture {
     /// An image shrunk to at most `width` pixels.
-    pub(crate) fn shrunk(caption: &str, scores: String, image: &Image, width: u32) -> Self {
+    pub fn shrunk(caption: &str, scores: String, image: &Image, width: u32) -> Self {
         let width = image.width.min(width);
         let height = u64::from(image.height) * u64::from(width) / u64::from(image.width.max(1));
         let image = image.resized(width, height as u32);
@@ -98,7 +106,7 @@ impl Report {
         self.tables.iter().map(NumberTable::html).collect()
     }
 
-    pub(crate) fn charts_html(&self) -> String {
+    pub fn charts_html(&self) -> String {
         let figure = |chart: &Chart| format!("<figure class=\"plot\">{}</figure>\n", chart.svg());
         let plots: String = self.charts.iter().map(figure).collect();
         if plots.is_empty() { plots } else { format!("<div class=\"plots\">\n{plots}</div>\n") }
@@ -110,13 +118,13 @@ impl Report {
     }
 
     /// The page around its body.
-    pub(crate) fn page(&self, body: &str) -> String {
+    pub fn page(&self, body: &str) -> String {
         let title = escape(&self.title);
         let mut html = format!(
             "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
              <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
              <title>{title}</title>\n<style>\n{}</style>\n</head>\n<body>\n<h1>{title}</h1>\n",
-            include_str!("report/style.css")
+            include_str!("style.css")
         );
         // Writing to a string cannot fail, so the results below are ignored.
         if let Some([address, text]) = &self.window {
@@ -170,7 +178,7 @@ impl Comparison {
 }
 
 /// Escapes text for HTML and SVG, also within a quoted attribute.
-pub(crate) fn escape(text: &str) -> String {
+pub fn escape(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for character in text.chars() {
         match character {

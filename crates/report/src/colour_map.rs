@@ -19,7 +19,7 @@ const VIRIDIS: [[u8; 3]; 9] = [
 const OUTLIERS: f64 = 0.01;
 
 /// The finite values of a plane without the least and the largest hundredth; `None` if there are none.
-pub(crate) fn range(plane: &[f32]) -> Option<[f32; 2]> {
+pub fn range(plane: &[f32]) -> Option<[f32; 2]> {
     let mut values: Vec<f32> = plane.iter().copied().filter(|value| value.is_finite()).collect();
     values.sort_unstable_by(f32::total_cmp);
     let last = values.len().checked_sub(1)?;
@@ -29,7 +29,7 @@ pub(crate) fn range(plane: &[f32]) -> Option<[f32; 2]> {
 
 /// The first plane of an image in colours: dark violet at the first end of the range, yellow at the second, black where
 /// the value is not finite.
-pub(crate) fn mapped(image: &Image, [from, to]: [f32; 2]) -> Image {
+pub fn mapped(image: &Image, [from, to]: [f32; 2]) -> Image {
     let pixels = image.pixel_count();
     let mut data = vec![0.0; 3 * pixels];
     for (pixel, &value) in image.data[..pixels].iter().enumerate() {

@@ -1,8 +1,7 @@
 //! Images within a page: base64 (RFC 4648) in a data URI.
 
+use nightsplat_core::Result;
 use nightsplat_photographs::image::{Image, ImageFile};
-
-use crate::Result;
 
 /// The image as an 8-bit PNG; an empty URI for an image without pixels.
 pub(super) fn png(image: &Image) -> String {
@@ -10,13 +9,13 @@ pub(super) fn png(image: &Image) -> String {
 }
 
 /// The image as a JPEG of high quality; an empty URI for an image without pixels.
-pub(crate) fn jpeg(image: &Image) -> String {
+pub fn jpeg(image: &Image) -> String {
     const QUALITY: u8 = 90;
     jpeg_of_quality(image, QUALITY)
 }
 
 /// The image as a JPEG; an empty URI for an image without pixels.
-pub(crate) fn jpeg_of_quality(image: &Image, quality: u8) -> String {
+pub fn jpeg_of_quality(image: &Image, quality: u8) -> String {
     uri("jpeg", image.to_jpeg(quality))
 }
 
@@ -27,7 +26,8 @@ fn uri(kind: &str, file: Result<Vec<u8>>) -> String {
     )
 }
 
-pub(crate) fn base64(bytes: &[u8]) -> String {
+/// The bytes as text of 64 characters, padded.
+pub fn base64(bytes: &[u8]) -> String {
     const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
     for group in bytes.chunks(3) {
