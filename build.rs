@@ -5,7 +5,6 @@
 //!
 //! - `build/precompiled.rs`: kernels that were compiled before
 //! - `build/kernels.rs`: compiles and reflects every kernel
-//! - `build/attributes.rs`: the table of attributes to GLSL
 //! - `build/compiler.rs`: GLSL to SPIR-V
 //! - `build/glsl.rs`: what GLSL says beside that: constants and comments
 //! - `build/reflection.rs`: SPIR-V to a description

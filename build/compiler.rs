@@ -14,11 +14,8 @@ pub(crate) struct Spirv {
     pub(crate) shipped: Vec<u32>,
 }
 
-/// The text of an included file; includes are looked up by name in `shaders-glsl/include`, but for what is made here.
+/// The text of an included file; includes are looked up by name in `shaders-glsl/include`.
 pub(crate) fn include(name: &str) -> Option<(String, String)> {
-    if name == super::attributes::INCLUDE {
-        return Some((name.to_owned(), super::attributes::glsl()));
-    }
     let path = Path::new(crate::SHADERS).join("include").join(name);
     Some((path.display().to_string(), fs::read_to_string(&path).ok()?))
 }

@@ -7,7 +7,6 @@ use std::path::{Path, PathBuf};
 use glsl::Text;
 use reflection::{Kernel, Structs};
 
-mod attributes;
 mod compiler;
 mod glsl;
 mod reflection;

@@ -6,9 +6,8 @@ use std::path::{Path, PathBuf};
 
 pub(crate) const FOLDER: &str = "precompiled";
 
-/// What the compiled kernels depend on: the shaders, the table that they include, and what compiles them.
-pub(crate) const SOURCES: [&str; 5] =
-    [crate::SHADERS, "build.rs", "build", "src/splats/attributes.rs", "Cargo.lock"];
+/// What the compiled kernels depend on: the shaders, and what compiles them.
+pub(crate) const SOURCES: [&str; 4] = [crate::SHADERS, "build.rs", "build", "Cargo.lock"];
 
 /// The packages in `Cargo.lock` whose version decides what is compiled.
 const COMPILERS: [&str; 3] = ["glslang", "glslang-sys", "spirq"];

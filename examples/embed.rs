@@ -15,7 +15,7 @@ use nightsplat::ash::{self, khr, vk};
 use nightsplat::glam::{DAffine3, DVec3, Vec3};
 use nightsplat::{
     Camera, FeatureStructs, Gaussians, Gpu, HostDevice, HostFrame, HostImage, ImageFormat,
-    ImageState, Purpose, RenderOptions, RenderSettings, Renderer, Target, require_features,
+    ImageState, Purpose, RenderOptions, RenderSettings, Renderer, Target, Upload, require_features,
 };
 
 const SIZE: [u32; 2] = [320, 240];

@@ -5,7 +5,8 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use nightsplat::splats::scene::ply;
+use nightsplat_models::gaussians::ply;
+
 use nightsplat::train::check_checkpoint;
 use nightsplat::{
     Dataset, Image, ImageFile, LoadOptions, Model, Profile, Result, ToneSettings, TrainConfig,

@@ -23,13 +23,13 @@ FORMAT = 57
 
 
 # The package, and the crates that it exports names of.
-PACKAGES = ["nightsplat", "nightsplat-core", "nightsplat-photographs", "nightsplat-synth"]
+PACKAGES = ["nightsplat", "nightsplat-core", "nightsplat-models", "nightsplat-photographs", "nightsplat-synth"]
 
 
 def documented(package: str, features: str) -> dict:
     """Rustdoc's JSON of a library."""
     command = ["cargo", "rustdoc", "--quiet", "--package", package, "--lib", "--no-default-features"]
-    command += ["--features", features] if package == "nightsplat" else []
+    command += ["--features", features]
     # The modules that names are exported of are hidden.
     options = ["-Z", "unstable-options", "--output-format", "json", "--document-hidden-items", "--cap-lints", "allow"]
     metadata = subprocess.run(
@@ -290,6 +290,8 @@ class Api:
         outer = NAMED.copy()
         for number in numbers:
             block = self.index[str(number)]["inner"]["impl"]
+            if is_hidden(self.index[str(number)]):
+                continue
             if block["trait"] is None:
                 for one in block["items"]:
                     self.associated(self.index[str(one)], path)
@@ -329,9 +331,12 @@ class Api:
 
 def main() -> None:
     is_embedded = sys.argv[1:] == ["--embedded"]
-    features = "glslang" if is_embedded else "glslang,train"
-    packages = PACKAGES[:2] if is_embedded else PACKAGES
-    api = Api({package.replace("-", "_"): documented(package, features) for package in packages})
+    features = {"nightsplat": "glslang"}
+    if not is_embedded:
+        features = {"nightsplat": "glslang,train", "nightsplat-models": "train"}
+    packages = PACKAGES[:3] if is_embedded else PACKAGES
+    crates = {package: documented(package, features.get(package, "")) for package in packages}
+    api = Api({package.replace("-", "_"): crate for package, crate in crates.items()})
     print(f"{api.items} public items, {api.parts} fields and variants")
     if api.hidden:
         sys.exit(f"the API uses types that are not part of it: {', '.join(api.hidden)}")

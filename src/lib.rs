@@ -18,7 +18,7 @@
 //!
 //! ```no_run
 //! use nightsplat::glam::{DAffine3, DVec3};
-//! use nightsplat::{Camera, DeviceChoice, Gpu, ImageFile, Model, RenderOptions, Renderer};
+//! use nightsplat::{Camera, DeviceChoice, Gpu, ImageFile, Model, RenderOptions, Renderer, Upload};
 //!
 //! let gpu = Gpu::new(&DeviceChoice::Best)?;
 //! let model = Model::load("model.ply")?;
@@ -82,7 +82,10 @@
 //!
 //! * `nightsplat-core`: errors, files, settings, cameras, images in memory, formulas of tone curves
 //! * `nightsplat-photographs`: images, datasets, tone curves and what is measured of them, without a device
+//! * `nightsplat-models`: Gaussians on the host, and the files of models
+//! * `nightsplat-diagnose`: what the photographs of a capture show: noise, blur, lamps, overlap
 //! * `nightsplat-fit`, `nightsplat-synth`: curves from pairs of photographs; synthetic datasets
+//! * `nightsplat-pose`: camera poses of dark photographs, by COLMAP
 //! * `nightsplat-report`: pages with tables and charts, videos, event files
 //! * `nightsplat-capi`: the C interface, above this crate
 //!
@@ -97,7 +100,6 @@
 //! - `driver`: opens devices whose driver was seen to compile every kernel
 //! - `splats`: Gaussians, the differentiable rasteriser, Adam, density control
 //! - `targets`: the targets of views, made from their photographs on the device
-//! - `pose`: camera poses of dark photographs, by COLMAP
 //! - `reference`: the CPU reference of each kernel, in plain loops
 //! - `networks`: denoiser, tonemapper and LPIPS
 //! - `loss`: the loss terms with their gradients, exposures of views, and the log
@@ -147,9 +149,6 @@ pub mod make;
 #[cfg(feature = "train")]
 #[doc(hidden)]
 pub mod networks;
-#[cfg(feature = "cli")]
-#[doc(hidden)]
-pub mod pose;
 #[cfg(feature = "train")]
 #[doc(hidden)]
 pub mod reference;
@@ -193,6 +192,9 @@ pub use nightsplat_core::{
     curves::SceneLaw,
     image::Image,
 };
+#[doc(inline)]
+pub use nightsplat_models::gaussians::{Features, Gaussians, Shape};
+pub use splats::device::{DeviceGaussians, GaussianSlice, Layout, Upload};
 pub use splats::lamp::Lamp;
 pub use splats::model::Model;
 pub use splats::packed_sh::StorageFormat;
@@ -200,9 +202,14 @@ pub use splats::render::{
     Damping, DepthConvention, DepthKind, Drawn, Gradients, Instance, Motion, Pick, PickedSplat,
     Purpose, RenderOptions, RenderSettings, Renderer, SceneDepth, Status, Target, Viewpoint,
 };
-pub use splats::scene::{DeviceGaussians, Features, GaussianSlice, Gaussians, Layout, Shape};
 
 // Photographs and training.
+#[cfg(feature = "train")]
+#[doc(inline)]
+pub use nightsplat_models::{
+    export::{Format, spz::Version as SpzVersion},
+    gaussians::init::Initialization,
+};
 #[cfg(feature = "train")]
 #[doc(inline)]
 pub use nightsplat_photographs::{
@@ -218,8 +225,6 @@ pub use nightsplat_photographs::{
 #[cfg(feature = "train")]
 pub use {
     loss::Term,
-    results::export::{Format, spz::Version as SpzVersion},
-    splats::scene::init::Initialization,
     train::{Ended, MemoryEstimate, Part, Preset, Rendered, StepReport, TrainConfig, Trainer},
 };
 

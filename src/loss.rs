@@ -19,10 +19,10 @@ use glam::UVec2;
 use nightsplat_core::random::Stream;
 use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
+use nightsplat_models::gaussians::{Feature, Features};
 
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::Camera;
-use crate::splats::scene::{Feature, Features};
 use crate::{Error, Result};
 pub use denoising::DenoisingLoss;
 pub use depth::{DepthBoxes, DepthLoss};

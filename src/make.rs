@@ -15,10 +15,10 @@ use nightsplat_photographs::dataset::{Dataset, LoadOptions};
 use nightsplat_photographs::image::files::photographs_in;
 use nightsplat_photographs::image::{Image, ImageFile};
 
-use crate::pose::{self, PoseOptions};
 use crate::results::run;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
+use nightsplat_pose::{self as pose, PoseOptions};
 
 /// A stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -9,12 +9,10 @@
 //! - [`comparison`]: runs on one dataset, view by view
 //! - [`diagnosis`]: a diagnosis of photographs as a table and a page
 //! - [`evaluation`]: scores as a table, and the page of a run
-//! - [`linear_light`]: renders and colours in the light of the photographs
-//! - [`models`]: model files and run directories, read
+//! - [`models`]: model files and run directories
 //! - [`finished_run`]: a finished run or a model file, opened for rendering
 //! - [`view_exposures`]: renders at the exposure of their targets
 //! - [`verdict`]: a sentence on a set of photographs, and on a trained model
-//! - [`export`]: a model in other formats
 //! - [`run_export`]: the export of a run
 //! - [`edit`]: changes of a model
 
@@ -23,9 +21,7 @@ pub mod diagnosis;
 pub mod edit;
 pub mod eval;
 pub mod evaluation;
-pub mod export;
 pub mod finished_run;
-pub mod linear_light;
 pub mod models;
 pub mod run;
 pub mod run_export;

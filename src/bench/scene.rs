@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use nightsplat_core::camera::{Camera, CameraModel};
 use nightsplat_core::random::Stream;
+use nightsplat_models::gaussians::{Features, Gaussians, MAX_SH_DEGREE, SH_C0, Shape};
 use nightsplat_photographs::dataset::{Dataset, Point, Split, View};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
@@ -13,9 +14,9 @@ use crate::Result;
 use crate::gpu::{CheckReport, Gpu};
 use crate::results::{models, run};
 use crate::splats::batches::GradientKind;
+use crate::splats::device::Upload;
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer, Status};
-use crate::splats::scene::{Features, Gaussians, MAX_SH_DEGREE, SH_C0, Shape};
 use crate::train::{Part, PrecisionConfig, TrainConfig, Trainer};
 
 /// Where the Gaussians come from.

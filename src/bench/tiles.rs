@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use nightsplat_core::camera::Camera;
 use nightsplat_core::table::aligned;
+use nightsplat_models::gaussians::{Features, MAX_SH_DEGREE};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
@@ -12,8 +13,8 @@ use super::{Bench, median, stages, total};
 use crate::Result;
 use crate::gpu::{Buffer, Resources, Sorting, Tile, TunedTile};
 use crate::splats::batches::GradientKind;
+use crate::splats::device::{DeviceGaussians, Layout, Upload};
 use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
-use crate::splats::scene::{DeviceGaussians, Features, Layout, MAX_SH_DEGREE};
 
 /// From a few pixels for narrow subgroups to 512 for wide ones.
 const SIZES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8], [32, 16]];

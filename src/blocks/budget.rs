@@ -1,8 +1,8 @@
 //! The memory and disk of a block's training, foreseen from its numbers.
 
+use nightsplat_models::attributes::rest_coefficients;
 use nightsplat_photographs::dataset::Dataset;
 
-use crate::splats::attributes::rest_coefficients;
 use crate::splats::packed_sh::StorageFormat;
 use crate::train::{CacheSize, TrainConfig};
 

@@ -4,11 +4,11 @@ use std::path::{Path, PathBuf};
 
 use nightsplat_core::camera::TrainingFrame;
 use nightsplat_core::output;
+use nightsplat_models::joined::{MANIFEST, MODEL};
 use serde::Serialize;
 
 use super::plan::{BLOCKS, BlockPlan, COARSE, LAW, PLAN, PlanFile, PlanRow};
 use super::task::{self, TASKS, Task};
-use crate::splats::joined::{MANIFEST, MODEL};
 use crate::splats::optimizer::Schedule;
 use crate::train::{CacheSize, TrainConfig};
 use crate::{Error, Result};

@@ -6,16 +6,16 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::{hash, input, output};
+use nightsplat_models::export::{Format, Provenance};
+use nightsplat_models::gaussians::{Gaussians, ply};
+use nightsplat_models::joined::{MANIFEST, ModelTile, TileManifest, VERSION};
 use nightsplat_photographs::dataset::block::{Block, Cell};
 use sha2::{Digest, Sha256};
 
 use super::folder::{model_of, task_folder};
 use super::plan::PlanFile;
-use crate::results::export::{Format, Provenance};
 use crate::results::models;
 use crate::results::run::{self, RunDirectory, TRAINED_WITH};
-use crate::splats::joined::{MANIFEST, ModelTile, TileManifest, VERSION};
-use crate::splats::scene::{Gaussians, ply};
 use crate::{Error, Result};
 
 /// The folder of the tiles, beside the manifest.

@@ -4,6 +4,7 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
+use nightsplat_models::gaussians::Features;
 
 use super::{finish, print};
 use crate::Error;
@@ -11,7 +12,6 @@ use crate::bench::tiles::TileTimings;
 use crate::bench::{Bench, BenchOptions, Findings, Source};
 use crate::driver;
 use crate::gpu::{DeviceChoice, TUNE_VARIABLE, TunedTile};
-use crate::splats::scene::Features;
 use crate::train::TrainConfig;
 
 /// Check a training step against the CPU references, then time its kernels and stages.

@@ -19,8 +19,9 @@ use crate::results::diagnosis;
 use crate::results::eval::{ResidualTransmittance, hole_warning};
 use crate::results::finished_run::FinishedRun;
 use crate::results::verdict;
-use crate::train::diagnose::{Diagnosis, Plan};
+use crate::train::plan::Plan;
 use crate::train::{Preset, RequestedSettings, diagnosed};
+use nightsplat_diagnose::Diagnosis;
 
 /// Measure photographs before training, and choose a model for them.
 ///

@@ -12,7 +12,7 @@ use crate::gpu::{
     CooperativeMatrix, DeviceChoice, DeviceReport, Gpu, SUBGROUP_VARIABLE, SchedulerVariables,
     devices,
 };
-use crate::pose::how_to_install;
+use nightsplat_pose::how_to_install;
 
 /// List the Vulkan devices and check what training requires of them.
 #[derive(Clone, Copy, Debug, clap::Args)]

@@ -8,13 +8,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use nightsplat_core::output::one_line;
+use nightsplat_models::edit::operation::EditList;
 use nightsplat_photographs::tree::check_writable;
 
 use self::operations::Operations;
 use super::{finish, opener, progress_bar, tell, tell_on_stderr, with_dataset, word};
 use crate::Error;
 use crate::gpu::DeviceChoice;
-use crate::results::edit::{EditList, EditScore, Editor};
+use crate::results::edit::{EditScore, Editor};
 
 /// Crop, clean, transform and merge models.
 ///

@@ -4,13 +4,13 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use nightsplat_core::camera::frame::relative_to;
+use nightsplat_models::export::streamed::{self, Division, MAX_LEVELS, Written};
+use nightsplat_models::export::{Format, spz};
 use nightsplat_photographs::tree::check_writable;
 
 use super::{finish, opener, word, words};
 use crate::Error;
 use crate::gpu::DeviceChoice;
-use crate::results::export::streamed::{self, Division, MAX_LEVELS, Written};
-use crate::results::export::{Format, spz};
 use crate::results::finished_run::is_model;
 use crate::results::run_export::up::{Turn, Up};
 use crate::results::run_export::{ExportOptions, Exported};

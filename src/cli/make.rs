@@ -16,9 +16,9 @@ use crate::driver;
 use crate::gpu::DeviceChoice;
 use crate::live;
 use crate::make::{MadePaths, MakeStage};
-use crate::pose::PoseOptions;
 use crate::results::run::{Requests, has_checkpoint};
 use crate::{Error, Stop};
+use nightsplat_pose::PoseOptions;
 
 /// From photographs to a page: cameras, training, page.
 ///
@@ -80,7 +80,6 @@ pub fn run(args: &MakeArgs, everything: bool) -> Result<()> {
     let device = config.device.parse::<DeviceChoice>()?;
     let cameras = PoseOptions {
         light: config.light,
-        device: device.clone(),
         overwrite: args.overwrite,
         ..args.cameras.options(&args.photos, &made.dataset)
     };
@@ -92,7 +91,7 @@ pub fn run(args: &MakeArgs, everything: bool) -> Result<()> {
     let requests = signals::requests()?;
     if needs_cameras {
         display.begin(MakeStage::Cameras);
-        let wrote = pose::posed(&cameras, &display.prefix(MakeStage::Cameras), &requests)?;
+        let wrote = pose::posed(&cameras, &device, &display.prefix(MakeStage::Cameras), &requests)?;
         if form != ProgressForm::Json {
             tell(one_line(&wrote));
         }

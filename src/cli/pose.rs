@@ -11,10 +11,12 @@ use nightsplat_photographs::image::StoredLight;
 use super::{finish, progress_bar, signals, tell_on_stderr, word};
 use crate::driver;
 use crate::gpu::DeviceChoice;
-use crate::pose::{
-    Mapper, Matcher, PoseFeatures, PoseOptions, PoseProgress, PoseWatch, Posed, describe, estimate,
-};
 use crate::results::run::Requests;
+use crate::targets::pseudo_gt::PseudoGt;
+use nightsplat_pose::{
+    Mapper, Matcher, PoseFeatures, PoseOptions, PoseProgress, PoseWatch, Posed, ToneMapper,
+    describe, estimate,
+};
 
 /// Estimate the cameras of dark photographs with COLMAP, and write a dataset for `train`.
 ///
@@ -102,16 +104,22 @@ pub fn run(args: &PoseArgs) -> Result<()> {
     let options = PoseOptions {
         overwrite: args.overwrite,
         light: args.light,
-        device: args.device.clone().unwrap_or_default(),
         ..args.choices.options(&args.photos, &args.out)
     };
-    let wrote = posed(&options, "", &signals::requests()?)?;
+    let device = args.device.clone().unwrap_or_default();
+    let wrote = posed(&options, &device, "", &signals::requests()?)?;
     finish(&wrote, &format!("nightsplat train {} --out run", word(&args.out)));
     Ok(())
 }
 
-/// Estimates the cameras, with a prefix of each line, and returns what was written.
-pub(super) fn posed(options: &PoseOptions, prefix: &str, requests: &Requests) -> Result<String> {
+/// Estimates the cameras of photographs that a device brightens, with a prefix of each line, and returns what was
+/// written.
+pub(super) fn posed(
+    options: &PoseOptions,
+    device: &DeviceChoice,
+    prefix: &str,
+    requests: &Requests,
+) -> Result<String> {
     let begin = Instant::now();
     let bar: RefCell<Option<ProgressBar>> = RefCell::default();
     let report = |progress: PoseProgress<'_>| match progress {
@@ -128,7 +136,8 @@ pub(super) fn posed(options: &PoseOptions, prefix: &str, requests: &Requests) ->
         }
     };
     let watch = PoseWatch { report: &report, stops: &|| requests.stops() };
-    let Posed { photographs, placed, bright, lenses } = estimate(options, &watch)?;
+    let Posed { photographs, placed, bright, lenses } =
+        estimate(options, &|| tone_mapper(device), &watch)?;
     let bright = bright.map(|[placed, all]| format!(" and {placed} of {all} bright ones"));
     Ok(format!(
         "{}: {placed} of {photographs} photographs{} with their cameras, {} calibrated ({})",
@@ -137,6 +146,14 @@ pub(super) fn posed(options: &PoseOptions, prefix: &str, requests: &Requests) ->
         if lenses.len() == 1 { "one".to_owned() } else { lenses.len().to_string() },
         lenses.iter().take(MAX_LISTED).map(describe).collect::<Vec<_>>().join("; ")
     ))
+}
+
+/// Tone-maps on a device.
+fn tone_mapper(device: &DeviceChoice) -> crate::Result<ToneMapper> {
+    let gpu = driver::open(device)?;
+    Ok(Box::new(move |scene, photograph, measured| {
+        PseudoGt::new(&gpu, scene.settings())?.tone_mapped(photograph, &scene.mapping_of(measured))
+    }))
 }
 
 impl PoseChoices {
@@ -160,8 +177,6 @@ impl PoseChoices {
             colmap_gpu: choices.colmap_gpu,
             fps: choices.fps,
             light: None,
-            device: DeviceChoice::default(),
-            open: driver::open,
         }
     }
 }

@@ -4,7 +4,16 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::Result;
+use nightsplat_core::camera::Easing;
+use nightsplat_core::output::{create_folder, one_line};
+use nightsplat_models::linear_light::{Clipped, STOPS, in_unit, photograph_of};
+use nightsplat_photographs::dataset::{Dataset, Split, View};
+use nightsplat_photographs::image::Image;
 use nightsplat_photographs::image::ImageFile as _;
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tree::check_writable;
+use nightsplat_report::colour_map;
+use nightsplat_report::video;
 
 mod shots;
 
@@ -15,16 +24,7 @@ use crate::Error;
 use crate::gpu::DeviceChoice;
 use crate::results::eval::RenderLayer;
 use crate::results::finished_run::FinishedRun;
-use crate::results::linear_light::{Clipped, STOPS, in_unit, photograph_of};
 use crate::results::view_exposures::ViewExposures;
-use nightsplat_core::camera::Easing;
-use nightsplat_core::output::{create_folder, one_line};
-use nightsplat_photographs::dataset::{Dataset, Split, View};
-use nightsplat_photographs::image::Image;
-use nightsplat_photographs::scene_tone::SceneTone;
-use nightsplat_photographs::tree::check_writable;
-use nightsplat_report::colour_map;
-use nightsplat_report::video;
 
 /// Render a run from the cameras of its dataset, or along a path through them.
 ///

@@ -23,7 +23,7 @@ use crate::results::eval;
 use crate::results::run::{self, Event, IfExists, Requests, RunDirectory, RunSummary, Session};
 use crate::results::run_facts::RunFacts;
 use crate::results::verdict;
-use crate::train::diagnose::Plan;
+use crate::train::plan::Plan;
 use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.

@@ -6,18 +6,19 @@ use std::sync::{Arc, Mutex};
 use anyhow::Result;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use nightsplat_core::camera::Camera;
+use nightsplat_models::export::Provenance;
+use nightsplat_models::export::page::{Bookmark, ModelPage, Sharing};
+use nightsplat_models::gaussians::{Gaussians, ModelFacts, Shape};
 use nightsplat_photographs::dataset::Dataset;
 
 use super::tell_on_stderr;
 use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::live::{DEFAULT_ADDRESS, Feed, Listen, Pictures, Server, Site};
-use crate::results::export::Provenance;
-use crate::results::export::page::{Bookmark, ModelPage, Sharing};
 use crate::results::finished_run::{config_of_file, is_model};
 use crate::results::run::{self, Requests};
+use crate::results::run_export::SHARED_GLSL;
 use crate::splats::render::RenderSettings;
-use crate::splats::scene::{Gaussians, ModelFacts, Shape};
 use crate::train::TrainConfig;
 use crate::{Error, Initialization};
 
@@ -170,7 +171,7 @@ fn page(path: &Path, provenance: Provenance) -> ModelPage<'static> {
 
 fn site(mut page: ModelPage<'_>, feed: Feed, pictures: Option<Pictures>) -> Result<Arc<Site>> {
     page.cameras = page.bookmarks.iter().map(|bookmark| bookmark.camera).collect();
-    let html = page.html()?;
+    let html = page.html(&SHARED_GLSL)?;
     Ok(Arc::new(Site { html: html.into(), feed, pictures: pictures.map(Mutex::new) }))
 }
 

@@ -8,9 +8,9 @@ use std::str::FromStr;
 use clap::builder::{PossibleValue, StringValueParser, TypedValueParser};
 use clap::{Arg, Command, Error};
 use nightsplat_core::curves::{CURVE_AUTO, name_of};
+use nightsplat_models::export::Format;
 use nightsplat_photographs::tone::ToneCurve;
 
-use crate::results::export::Format;
 use crate::train::{Part, Preset};
 
 /// Parses a `T`, of which some values have names. Others may exist, such as files.

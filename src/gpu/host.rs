@@ -28,7 +28,7 @@ pub(super) struct Host {
     /// The number of the last frame that was recorded.
     last_frame: AtomicU64,
     /// Uploads for the next recording, in order.
-    uploads: Mutex<Vec<Upload>>,
+    uploads: Mutex<Vec<PendingUpload>>,
     /// Those of recordings that may have been dropped.
     recorded: Mutex<Vec<RecordedUploads>>,
     /// The pipeline cache is the host's.
@@ -41,7 +41,7 @@ unsafe impl Send for Host {}
 unsafe impl Sync for Host {}
 
 /// A change of a buffer that the next recording begins with.
-pub(super) enum Upload {
+pub(super) enum PendingUpload {
     /// Every 32-bit word.
     Fill {
         target: Bound,
@@ -58,7 +58,7 @@ pub(super) enum Upload {
 struct RecordedUploads {
     /// Of the host's; `None`: of a submission of our own, which is not dropped.
     frame: Option<u64>,
-    uploads: Vec<Upload>,
+    uploads: Vec<PendingUpload>,
     /// A word on the host that the recording sets to 1: a frame that is done may never have been submitted.
     has_run: DeviceMemory,
 }
@@ -69,7 +69,7 @@ impl RecordedUploads {
     }
 }
 
-impl Upload {
+impl PendingUpload {
     fn target(&self) -> vk::Buffer {
         match self {
             Self::Fill { target, .. } | Self::Copy { target, .. } => target.raw,
@@ -113,12 +113,12 @@ impl Host {
         }
     }
 
-    pub(super) fn add(&self, upload: Upload) {
+    pub(super) fn add(&self, upload: PendingUpload) {
         lock(&self.uploads).push(upload);
     }
 
     /// Puts uploads before those that wait.
-    fn requeue(&self, mut first: Vec<Upload>) {
+    fn requeue(&self, mut first: Vec<PendingUpload>) {
         let mut waiting = lock(&self.uploads);
         first.append(&mut waiting);
         *waiting = first;
@@ -126,7 +126,7 @@ impl Host {
 
     /// Forgets the uploads into a buffer that is dropped.
     pub(super) fn forget(&self, target: vk::Buffer) {
-        let is_into = |upload: &mut Upload| upload.target() == target;
+        let is_into = |upload: &mut PendingUpload| upload.target() == target;
         // Memory is dropped once the lists are free again.
         let forgotten: Vec<_> = lock(&self.uploads).extract_if(.., is_into).collect();
         drop(forgotten);

@@ -3,7 +3,7 @@
 use gpu_allocator::MemoryLocation;
 
 use super::allocated::DeviceMemory;
-use super::host::Upload;
+use super::host::PendingUpload;
 use super::{Bound, Buffer, Gpu, SliceMut};
 use crate::Result;
 
@@ -19,7 +19,7 @@ impl Gpu {
     /// Zeroes a buffer.
     pub(crate) fn zeroed<T: bytemuck::Pod>(&self, buffer: Buffer<T>) -> Result<Buffer<T>> {
         if !buffer.is_empty() {
-            let fills = buffer.pieces().map(|target| Ok(Upload::Fill { target, word: 0 }));
+            let fills = buffer.pieces().map(|target| Ok(PendingUpload::Fill { target, word: 0 }));
             self.upload(buffer.name(), fills)?;
         }
         Ok(buffer)
@@ -59,18 +59,22 @@ impl Gpu {
     }
 
     /// A copy of `bytes` to the start of `target`.
-    fn staged(&self, target: Bound, bytes: &[u8]) -> Result<Upload> {
+    fn staged(&self, target: Bound, bytes: &[u8]) -> Result<PendingUpload> {
         let size = bytes.len() as u64;
         let location = MemoryLocation::CpuToGpu;
         let mut staging = DeviceMemory::new(&self.shared, "staging", size, location)?;
         if let Some(mapped) = staging.mapped_mut() {
             mapped[..bytes.len()].copy_from_slice(bytes);
         }
-        Ok(Upload::Copy { staging, target, bytes: size })
+        Ok(PendingUpload::Copy { staging, target, bytes: size })
     }
 
     /// Makes changes of a buffer: at once, or with the next recording where a host lends the device.
-    fn upload(&self, name: &str, uploads: impl Iterator<Item = Result<Upload>>) -> Result<()> {
+    fn upload(
+        &self,
+        name: &str,
+        uploads: impl Iterator<Item = Result<PendingUpload>>,
+    ) -> Result<()> {
         let uploads = uploads.collect::<Result<Vec<_>>>()?;
         match &self.shared.host {
             Some(host) => {

@@ -8,13 +8,13 @@ use std::time::{Duration, Instant};
 
 use glam::Vec3;
 use hyper::body::Bytes;
+use nightsplat_models::edit::operation::fingerprint;
+use nightsplat_models::export::page::packed;
+use nightsplat_models::gaussians::{Gaussians, ModelFacts};
 use serde_json::{Value, json};
 
-use crate::results::edit::fingerprint;
-use crate::results::export::page::packed;
 use crate::results::models;
 use crate::results::run::{Event, Requests, Stamp, WatchedRun, stamp};
-use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::{Result, Stop};
 
 /// The most Gaussians that are sent: those that cover most, by opacity and size.
@@ -301,7 +301,7 @@ fn most_visible(gaussians: &Gaussians, most: usize) -> Cow<'_, Gaussians> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::splats::scene::{Features, Shape};
+    use nightsplat_models::gaussians::{Features, Shape};
 
     fn model(opacities: &[f32]) -> Gaussians {
         let shape = Shape { sh_degree: 0, features: Features::NONE };

@@ -8,6 +8,7 @@ use glam::DVec3;
 use hyper::body::Bytes;
 use nightsplat_core::camera::CameraModel;
 use nightsplat_core::natural;
+use nightsplat_models::export::page::{Bookmark, PageImage, moved};
 use nightsplat_photographs::dataset::{Dataset, LoadOptions, MeasuredSize, View};
 use nightsplat_photographs::image::{Image, ImageFile};
 use nightsplat_photographs::tone::ToneCurve;
@@ -15,7 +16,6 @@ use nightsplat_photographs::tone::ToneCurve;
 use crate::Result;
 use crate::driver;
 use crate::gpu::Gpu;
-use crate::results::export::page::{Bookmark, PageImage, moved};
 use crate::targets::Targets;
 use crate::train::TrainConfig;
 

@@ -233,7 +233,7 @@ mod tests {
 
     use super::*;
     use crate::live::Feed;
-    use crate::splats::scene::Gaussians;
+    use nightsplat_models::gaussians::Gaussians;
 
     fn server() -> Server {
         let feed = Feed::of_gaussians(&Gaussians::zeros(1, 0));

@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use glam::UVec2;
 use nightsplat_core::random::Stream;
+use nightsplat_models::gaussians::Feature;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
@@ -16,7 +17,6 @@ use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{
     DepthGradient, DepthMoments, depth_boxes, depth_correlation, depth_gradient, depth_moments,
 };
-use crate::splats::scene::Feature;
 use crate::{Error, Result};
 
 pub(super) const SPEC: LossSpec = LossSpec {

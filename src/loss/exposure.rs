@@ -11,13 +11,13 @@ pub mod table;
 use glam::{UVec2, Vec2};
 use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
+use nightsplat_models::gaussians::COLOR_CHANNELS;
 
 use super::{no_scratch, pixel_count};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use crate::kernels::{expose, expose_backward, exposure_center, exposure_gradient};
 use crate::splats::optimizer::{AdamBuffers, Learnable, Moments};
-use crate::splats::scene::COLOR_CHANNELS;
 use crate::{Error, Result};
 pub use affine::Affine;
 

@@ -161,8 +161,8 @@ impl LogSlot<'_> {
 mod tests {
     use super::*;
     use crate::loss::{LossConfig, ParameterWeights, Weights};
-    use crate::splats::scene::Features;
     use nightsplat_core::random::Stream;
+    use nightsplat_models::gaussians::Features;
 
     #[test]
     fn the_total_sums_distances_and_one_minus_similarities() {

@@ -5,6 +5,8 @@
 
 use std::sync::Arc;
 
+use nightsplat_models::gaussians::COLOR_CHANNELS;
+
 use super::log::{LogSlot, PartialSums};
 use super::{
     LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, check_weight, no_scratch, pixel_count,
@@ -13,7 +15,6 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::map_normal::NO_NORMAL;
 use crate::kernels::{Camera, normals, normals_backward};
-use crate::splats::scene::COLOR_CHANNELS;
 
 pub(super) const SPEC: LossSpec = LossSpec {
     terms: &[Term::NORMALS],

@@ -16,7 +16,7 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::parameter_terms;
 use crate::splats::batches::Batch;
-use crate::splats::scene::GaussianSlice;
+use crate::splats::device::GaussianSlice;
 
 pub(super) const SPEC: LossSpec =
     LossSpec { terms: &[Term::OPACITY, Term::SCALE, Term::ANISOTROPY], on: TermOn::Parameters };

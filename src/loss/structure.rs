@@ -1,6 +1,7 @@
 //! The structure term: the structure channel of the render against the structure of the target.
 
 use glam::UVec2;
+use nightsplat_models::gaussians::Feature;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
@@ -9,7 +10,6 @@ use super::{
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::structure_l1;
-use crate::splats::scene::Feature;
 use crate::targets::structure::StructureTarget;
 
 pub(super) const SPEC: LossSpec = LossSpec {

@@ -1,3 +1,4 @@
+use nightsplat_models::attributes::{Attribute, planes};
 use nightsplat_photographs::tone::Real;
 
 use super::rounding::Rounded;
@@ -5,7 +6,6 @@ use crate::gpu::Reference;
 use crate::kernels::adam::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::adam_step::{BETA1, BETA2, EPSILON, GRADIENT_BOUND};
 use crate::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
-use crate::splats::attributes::{Attribute, planes};
 use crate::splats::batches::frozen_floats;
 
 /// The parameter and both moments after a step at `rate`. A compiler folds 1 - beta in double precision.

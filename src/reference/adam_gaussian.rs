@@ -1,4 +1,5 @@
 use glam::DVec3;
+use nightsplat_models::attributes::{Attribute, PlaneCounts, column_count, planes};
 
 use super::adam::{bounded, clamp_gradient, stepped};
 use super::camera::ReferenceCamera;
@@ -10,7 +11,6 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::adam_gaussian::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::adam_step::{BETA1, BETA2};
 use crate::kernels::half::{LARGEST_HALF, SMALLEST_HALF};
-use crate::splats::attributes::{Attribute, PlaneCounts, column_count, planes};
 use crate::splats::batches::frozen_floats;
 use crate::splats::packed_sh::{PackedSh, nearest, value};
 

@@ -1,10 +1,11 @@
+use nightsplat_models::attributes::Attribute;
+
 use crate::gpu::Reference;
 use crate::kernels::densify_action::{
     ACTION_CLONE, ACTION_KEEP, ACTION_PRUNE, ACTION_SPLIT, COUNTER_CANDIDATES, COUNTER_CLONED,
     COUNTER_PRUNED, COUNTER_SPLIT, KEY_KEEP, KEY_PRUNE,
 };
 use crate::kernels::densify_decide::{Constants, Kernel, Params, Slices};
-use crate::splats::attributes::Attribute;
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {

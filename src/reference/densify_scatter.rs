@@ -3,6 +3,7 @@
 use std::f32::consts::TAU;
 
 use glam::{Quat, Vec3};
+use nightsplat_models::attributes::Attribute;
 
 use super::gaussian::{Words, sigmoid};
 use super::random::random_bits;
@@ -14,7 +15,6 @@ use crate::kernels::densify_action::{
     SPLIT_OPACITY_SLOPE,
 };
 use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::splats::attributes::Attribute;
 
 fn random_uniform(key: u32) -> f32 {
     ((random_bits(key) >> 8) + 1) as f32 / 16_777_216.0

@@ -1,6 +1,7 @@
 //! The score of each Gaussian for densification, and the estimated change of the cameras' views by a split.
 
 use glam::{DMat3, DVec2};
+use nightsplat_models::attributes::Attribute;
 
 use super::camera::ReferenceCamera;
 use super::gaussian::{Gaussian, Planes, Words, sigmoid};
@@ -13,7 +14,6 @@ use crate::kernels::densify_action::{
 };
 use crate::kernels::densify_score::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::DILATION;
-use crate::splats::attributes::Attribute;
 
 fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
     match slices.visit_counts[i] {

@@ -1,11 +1,11 @@
-//! One Gaussian's attributes in the planes of [`attributes`](crate::splats::attributes).
+//! One Gaussian's attributes in the planes of [`attributes`](nightsplat_models::attributes).
 
 use std::borrow::Cow;
 use std::ops::Range;
 
 use glam::{DVec3, DVec4};
+use nightsplat_models::attributes::{Attribute, AttributePlane, PlaneCounts, column_count, planes};
 
-use crate::splats::attributes::{Attribute, AttributePlane, PlaneCounts, column_count, planes};
 use crate::splats::packed_sh::PackedSh;
 
 /// A Gaussian, or the gradient of one, in f64.

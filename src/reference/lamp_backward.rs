@@ -1,6 +1,7 @@
 //! The sums of the gradients of the lamp's numbers over chunks of Gaussians.
 
 use glam::DVec3;
+use nightsplat_models::attributes::Attribute;
 
 use super::camera::ReferenceCamera;
 use super::lamp::{ReferenceLamp, WIDTH};
@@ -10,7 +11,6 @@ use crate::gpu::Reference;
 use crate::kernels::lamp::LAMP_NUMBERS;
 use crate::kernels::lamp_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::sh::SH_C0;
-use crate::splats::attributes::Attribute;
 use crate::splats::batches::frozen_floats;
 
 /// The numbers before the lamp's among the inputs of a Gaussian: its mean, its lit colour, and the gradient of its DC.

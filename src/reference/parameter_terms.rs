@@ -2,12 +2,12 @@
 
 use std::ops::Range;
 
+use nightsplat_models::attributes::Attribute;
 use nightsplat_photographs::tone::Real;
 
 use super::rounding::{Rounded, chain, sum_tolerance, write, write_sum};
 use crate::gpu::Reference;
 use crate::kernels::parameter_terms::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::splats::attributes::Attribute;
 use crate::splats::batches::frozen_floats;
 
 /// A value that a term sums, and its derivative with respect to the parameter, in any number type.

@@ -1,6 +1,7 @@
 //! From the records of a splat to the gradients of its Gaussian, in f64.
 
 use glam::{DMat3, DVec2, DVec3, DVec4, UVec2};
+use nightsplat_models::attributes::{Attribute, column_count};
 
 use super::camera::ReferenceCamera;
 use super::gaussian::{Gaussian, Planes, Words, sigmoid};
@@ -15,7 +16,6 @@ use crate::kernels::project_backward::{Constants, Kernel, Params, Slices, Tolera
 use crate::kernels::shared_intersections::SHARED_INTERSECTIONS;
 use crate::kernels::splat::{DILATION, RECORD_HEAD};
 use crate::kernels::status::STATUS_GRADIENT;
-use crate::splats::attributes::{Attribute, column_count};
 use crate::splats::batches::frozen_floats;
 
 /// The gradients that arrive at one splat.

@@ -1,9 +1,9 @@
 //! Real spherical harmonics to degree 3 and their derivatives, as in `include/sh.glsl`, in f64.
 
 use glam::DVec3;
+pub use nightsplat_models::harmonics::{sh_basis, sh_count};
 
 use crate::kernels::sh::{SH_C1, SH_C2, SH_C3};
-pub use crate::splats::harmonics::{sh_basis, sh_count};
 
 /// The derivative of the basis with respect to x, y, z of the direction.
 pub fn sh_basis_gradient(degree: u32, d: DVec3) -> [DVec3; 16] {

@@ -1,12 +1,12 @@
 //! The lowest standard deviations that training views resolve, in f64.
 
 use glam::{DVec2, DVec3};
+use nightsplat_models::attributes::Attribute;
 
 use super::camera::ReferenceCamera;
 use super::rounding::UNIT;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::smoothing_floor::{Constants, Kernel, Params, SEEN_MARGIN, Slices, Tolerances};
-use crate::splats::attributes::Attribute;
 
 /// The world units between two samples of the finest view that sees a point up to `margin` outside; `None`: no view
 /// does.

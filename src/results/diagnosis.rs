@@ -1,6 +1,7 @@
 //! A diagnosis as a table, as lines and as a page: verdict, plan, photographs with their targets, measurements.
 
 use nightsplat_core::natural;
+use nightsplat_models::linear_light::target_of;
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::ToneSettings;
@@ -8,11 +9,11 @@ use nightsplat_report::{
     Best, Column, ContactSheet, Distribution, NumberTable, Report, TextTable, distributions,
 };
 
-use crate::results::linear_light::target_of;
 use crate::results::verdict;
-use crate::train::diagnose::{
-    ChannelNoise, Diagnosis, LampDiagnosis, Plan, SceneDiagnosis, TargetNoise, ViewDiagnosis,
-    is_blurred, median,
+use crate::train::plan::Plan;
+use nightsplat_diagnose::{
+    ChannelNoise, Diagnosis, LampDiagnosis, SceneDiagnosis, TargetNoise, ViewDiagnosis, is_blurred,
+    median,
 };
 
 /// A column of the table of photographs: name, decimals, meaning with its unit, bad values in words, and whether a

@@ -4,12 +4,7 @@
 //! model was moved to before. The same model, operations and dataset give the same bits.
 
 mod capture;
-mod content;
 mod evidence;
-mod floaters;
-mod operation;
-mod placement;
-mod step;
 
 use std::fmt::Write as _;
 use std::fs::File;
@@ -20,22 +15,22 @@ use glam::DVec3;
 use nightsplat_core::camera::enclosing_sphere;
 use nightsplat_core::output::{create_folder_of, is_same_file, write_whole};
 use nightsplat_core::ply::PlyHeader;
+use nightsplat_models::edit::content::Content;
+use nightsplat_models::edit::floaters::{self, CameraPositions, Floaters};
+use nightsplat_models::edit::operation::{EditList, Operation, Region, Scale, Span, fingerprint};
+use nightsplat_models::edit::placement::Placement;
+use nightsplat_models::edit::step::Step;
+use nightsplat_models::export::{EDITS, Format, Provenance};
+use nightsplat_models::gaussians::ply::parts::PART;
+use nightsplat_models::gaussians::{Features, Gaussians, ModelFacts, Shape, is_far};
 use nightsplat_photographs::tree::check_writable;
 
 use self::capture::ModelPhotographs;
-use self::content::Content;
 use self::evidence::Measured;
-use self::floaters::{CameraPositions, Floaters};
-use self::placement::Placement;
-use self::step::Step;
 use crate::results::eval::ScoreReference;
-use crate::results::export::{EDITS, Format, Provenance};
 use crate::results::finished_run::{Opener, is_model};
 use crate::results::{models, run};
-use crate::splats::scene::{Features, Gaussians, ModelFacts, Shape, is_far};
 use crate::{Error, Result};
-use operation::Span;
-pub(crate) use operation::{EditList, Operation, Region, Scale, fingerprint};
 
 /// The rendered weight, in pixels over all training views, from which a Gaussian is shown by them.
 const SHOWN: f64 = 0.01;
@@ -73,7 +68,13 @@ pub(crate) struct EditScore {
 impl Editor {
     /// Opens a run or a model file.
     pub(crate) fn open(path: &Path, dataset: Option<&Path>, opener: Opener) -> Result<Self> {
-        let (content, facts) = Content::open(path)?;
+        let (content, facts) = match models::open_parts(path, PART)? {
+            Some((file, facts)) => (Content::of_file(path, file)?, facts),
+            None => {
+                let (gaussians, facts) = models::read(path)?;
+                (Content::of_whole(gaussians), facts)
+            }
+        };
         Ok(Self {
             path: path.to_owned(),
             dataset: dataset.map(Path::to_owned),
@@ -259,13 +260,16 @@ impl Editor {
         self.open_capture()?;
         let (placement, facts) = (self.placement, &self.facts);
         let Some(capture) = &self.capture else { return Ok(String::new()) };
-        let measured = |gaussians: &Gaussians| Measured::new(capture, placement, gaussians, facts);
+        let targets = capture.targets()?;
+        let measured = |gaussians: &Gaussians| {
+            Measured::new(capture, placement, gaussians, facts).evidence(&targets)
+        };
         let gaussians = self.content.whole()?;
         let cameras = capture.cameras();
         let positions = cameras.iter().map(|camera| placement.camera(camera).center()).collect();
         let cameras = CameraPositions { positions, near: capture.near(facts, &placement) };
         let Floaters { keep, contradicted, unseen } =
-            floaters::find(&gaussians, &capture.targets()?, &cameras, measured, observe)?;
+            floaters::find(&gaussians, &cameras, measured, observe)?;
         let kept = retained("floaters", gaussians.into_owned(), &keep)?;
         self.content.set(kept);
         Ok(format!("floaters: {contradicted} contradicted, {unseen} unseen"))

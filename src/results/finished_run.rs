@@ -3,6 +3,7 @@
 use std::ffi::OsStr;
 use std::path::Path;
 
+use nightsplat_models::gaussians::{Gaussians, ModelFacts};
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
 
@@ -11,7 +12,6 @@ use crate::results::eval::ModelRenderer;
 use crate::results::{models, run};
 use crate::splats::lamp::Lamp;
 use crate::splats::model::Model;
-use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 

@@ -1,17 +1,15 @@
-//! Reads a model from a file of any format, or from a run directory.
+//! Reads and writes models: files of any format, and run directories.
 
 use std::path::Path;
 
-use nightsplat_core::error::Error;
-use nightsplat_core::input;
-use nightsplat_core::ply::CONVERTER;
+use nightsplat_models::export::{Format, Provenance};
+use nightsplat_models::files;
+use nightsplat_models::gaussians::ply::parts::PartFile;
+use nightsplat_models::gaussians::{Gaussians, ModelFacts};
 
 use crate::Result;
-use crate::results::export::{sog, spz};
 use crate::results::run;
-use crate::splats::model::{FileKind, Model};
-use crate::splats::scene::ply::parts::PartFile;
-use crate::splats::scene::{Gaussians, ModelFacts, ply};
+use crate::splats::model::Model;
 use crate::train::TrainConfig;
 
 impl Model {
@@ -23,127 +21,59 @@ impl Model {
     /// [`RenderSettings::default`](crate::RenderSettings::default).
     ///
     /// # Errors
-    /// [`Error::Input`] if the file is missing, not a model or truncated, states an invalid fact, or has no Gaussian
-    /// that is finite, others being left out with a warning, or if the run neither finished nor reached a checkpoint.
+    /// [`Error::Input`](crate::Error::Input) if the file is missing, not a model or truncated, states an invalid fact,
+    /// or has no Gaussian that is finite, others being left out with a warning, or if the run neither finished nor
+    /// reached a checkpoint.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
         let (gaussians, facts) = read(path.as_ref())?;
         Ok(Self::of_shown(gaussians, &facts))
     }
+
+    /// Writes the model in the format that the file's extension names: `.ply`, `.spz`, `.glb`, `.usda`, `.usdz` or
+    /// `.sog`. The file states the near plane, the alpha limit, the colours and the origin.
+    ///
+    /// # Errors
+    /// As [`Gaussians::save`].
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
+        let path = path.as_ref();
+        self.save_as(path, Format::from_path(path)?)
+    }
+
+    /// Writes the model in a format, regardless of the file's extension.
+    ///
+    /// # Errors
+    /// As [`Gaussians::save`].
+    pub fn save_as(&self, path: impl AsRef<Path>, format: Format) -> Result<()> {
+        let provenance = Provenance { facts: self.facts(), ..Provenance::default() };
+        format.write(&self.shown(), &provenance, path.as_ref())
+    }
 }
 
-/// The Gaussians in the colours that viewers show, and the facts that the file or the run's configuration states. Warns
-/// if the near plane is missing, and of Gaussians of a file that are left out, as they are not finite.
+/// The Gaussians in the colours that viewers show, and the facts that the file or the run's configuration states.
+/// Warns as [`files::read`].
 pub(crate) fn read(path: &Path) -> Result<(Gaussians, ModelFacts)> {
-    if path.is_dir() {
-        let config = run::load_config(path)?;
-        let gaussians = run::load_gaussians(path)?;
-        let file = PartFile::open(&path.join("model.ply"), 1)?;
-        return Ok((gaussians, facts_of_run(&config, file.as_ref())));
+    if !path.is_dir() {
+        return files::read(path);
     }
-    let (facts, mut gaussians) = match PartFile::open(path, 1)? {
-        Some(file) => (file.facts().clone(), file.whole()?),
-        None => read_whole(path)?,
-    };
-    let count = gaussians.count;
-    gaussians.retain_finite();
-    warn_of_left_out(path, count, gaussians.count)?;
-    warn_of(path, &facts);
-    Ok((gaussians, facts))
+    let config = run::load_config(path)?;
+    let gaussians = run::load_gaussians(path)?;
+    let file = PartFile::open(&path.join("model.ply"), 1)?;
+    Ok((gaussians, facts_of_run(&config, file.as_ref())))
 }
 
-/// A model in a format that is read whole.
-fn read_whole(path: &Path) -> Result<(ModelFacts, Gaussians)> {
-    let bytes = input::bytes_if(path, |start| FileKind::from_bytes(start).is_some())?;
-    let parsed = match FileKind::from_bytes(&bytes) {
-        Some(FileKind::Ply) => ply::parse_any(&bytes),
-        Some(FileKind::Spz) => spz::decode(&bytes),
-        Some(FileKind::Sog) => sog::decode(&bytes),
-        None if path.extension().is_some_and(|ending| ending == "splat" || ending == "ksplat") => {
-            Err(format!("is neither PLY, SPZ nor SOG; {CONVERTER}"))
-        }
-        None if path.extension().is_some_and(|ending| ending == "html") => {
-            let problem = "is a page, not a model; pass the run or the model that it was made of";
-            Err(problem.to_owned())
-        }
-        None => {
-            Err("is not a model: neither PLY, SPZ nor SOG; name one, or a run directory".to_owned())
-        }
-    };
-    let (gaussians, facts) = parsed.map_err(|problem| ply::unusable(path, &problem))?;
-    Ok((facts, gaussians))
-}
-
-/// Opens a PLY for reading part by part; `None` for other formats.
+/// Opens a PLY, or that of a run, for reading part by part; `None` for other formats.
 pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, ModelFacts)>> {
-    if path.is_dir() {
-        let config = run::load_config(path)?;
-        let file = PartFile::open(&path.join("model.ply"), part)?;
-        let facts = facts_of_run(&config, file.as_ref());
-        return Ok(file.map(|file| (file, facts)));
+    if !path.is_dir() {
+        return files::open_parts(path, part);
     }
-    let file = PartFile::open(path, part)?;
-    Ok(file.map(|file| {
-        let facts = file.facts().clone();
-        warn_of(path, &facts);
-        (file, facts)
-    }))
+    let config = run::load_config(path)?;
+    let file = PartFile::open(&path.join("model.ply"), part)?;
+    let facts = facts_of_run(&config, file.as_ref());
+    Ok(file.map(|file| (file, facts)))
 }
 
 /// The facts of a run's configuration, and the law that its model states; that of joined blocks states none.
 fn facts_of_run(config: &TrainConfig, model: Option<&PartFile>) -> ModelFacts {
     let law = model.and_then(|model| model.facts().law);
     ModelFacts { law, ..config.facts(&config.frame.unwrap_or_default()) }
-}
-
-/// Warns if Gaussians of a file are left out; refuses it if all are.
-pub(crate) fn warn_of_left_out(path: &Path, count: usize, left: usize) -> Result<()> {
-    if left == count {
-        return Ok(());
-    }
-    let problem = format!("{} of {count} Gaussians have an infinity or NaN", count - left);
-    if left == 0 {
-        return Err(Error::input(path, format!("{problem}; export the model again")));
-    }
-    tracing::warn!("{}: {problem}, and are left out", path.display());
-    Ok(())
-}
-
-fn warn_of(path: &Path, facts: &ModelFacts) {
-    if facts.near.is_none() {
-        tracing::warn!("{}: does not state its near plane; the default is used", path.display());
-    }
-    if let Some(stops) = facts.linear {
-        let path = path.display();
-        tracing::warn!(
-            "{path}: its colours are linear light, raised by {stops} stops, and are shown as they are"
-        );
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::results::export::tests::drawn;
-
-    #[test]
-    fn files_of_other_programs_are_named_with_a_converter() {
-        let folder = tempfile::tempdir().unwrap();
-        let problem = |name: &str, bytes: &[u8]| {
-            let path = folder.path().join(name);
-            std::fs::write(&path, bytes).unwrap();
-            read(&path).unwrap_err().to_string()
-        };
-        let packed = b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nend_header\n";
-        assert!(problem("a.compressed.ply", packed).contains("splat-transform"));
-        assert!(problem("a.splat", &[0; 64]).contains("splat-transform"));
-        assert!(!problem("a.txt", &[0; 64]).contains("splat-transform"));
-        let mut model = drawn(3, 0);
-        model.dc_mut()[1].y = f32::NAN;
-        model.save(folder.path().join("a.ply")).unwrap();
-        assert_eq!(read(&folder.path().join("a.ply")).unwrap().0.count, 2);
-        model.means_mut().fill(glam::Vec3::INFINITY);
-        model.save(folder.path().join("a.ply")).unwrap();
-        let refused = read(&folder.path().join("a.ply")).unwrap_err().to_string();
-        assert!(refused.contains("3 of 3 Gaussians have an infinity or NaN"), "{refused}");
-    }
 }

@@ -9,21 +9,22 @@ use std::path::{Path, PathBuf};
 
 use glam::{DQuat, DVec3};
 use nightsplat_core::output::{create_folder_of, is_same_file, own_file, write_whole};
+use nightsplat_models::edit::operation::fingerprint;
+use nightsplat_models::export::page::ModelPage;
+use nightsplat_models::export::streamed::{self, Division, TileLoader, Written};
+use nightsplat_models::export::{Format, Provenance};
+use nightsplat_models::gaussians::{Gaussians, MAX_SH_DEGREE, ModelFacts};
+use nightsplat_models::joined::TileManifest;
+use nightsplat_models::levels;
+use nightsplat_models::linear_light::linear_gaussians;
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::scene_tone::SceneTone;
 
+pub(crate) use self::page::SHARED_GLSL;
 use self::up::Turn;
 pub use self::up::Up;
-use crate::results::edit::fingerprint;
-use crate::results::export::page::ModelPage;
-use crate::results::export::streamed::{self, Division, TileLoader, Written};
-use crate::results::export::{Format, Provenance};
 use crate::results::finished_run::{Opener, config_of_file, is_model, needs_photographs};
-use crate::results::linear_light::linear_gaussians;
 use crate::results::{models, run};
-use crate::splats::joined::TileManifest;
-use crate::splats::levels;
-use crate::splats::scene::{Gaussians, MAX_SH_DEGREE, ModelFacts};
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
@@ -171,7 +172,7 @@ impl ExportOptions<'_> {
             (Format::Html, Some(page)) => {
                 let fingerprint = Some(fingerprint(gaussians));
                 let page = ModelPage { gaussians: Some(gaussians), fingerprint, ..page.clone() };
-                write_whole(path, page.html()?.as_bytes())?;
+                write_whole(path, page.html(&SHARED_GLSL)?.as_bytes())?;
             }
             (format, _) => format.write(gaussians, provenance, path)?,
         }

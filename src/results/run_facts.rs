@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::eval::{ReferenceKind, ScoreReference};
 use crate::gpu::Gpu;
 use crate::train::TrainConfig;
-use crate::train::diagnose::Plan;
+use crate::train::plan::Plan;
 
 /// Dataset, device, views, split, points and curve of a run.
 #[derive(Clone, Debug, Serialize)]

@@ -1,7 +1,7 @@
 //! Verdicts in a sentence: on a set of photographs, and on a trained model.
 
 use super::eval::{After, Evaluation, MAX_RESIDUAL_TRANSMITTANCE, Metric, ReferenceKind};
-use crate::train::diagnose::{Diagnosis, SceneDiagnosis};
+use nightsplat_diagnose::{Diagnosis, SceneDiagnosis};
 
 /// What a set of photographs is like, and whether anything needs attention.
 pub(crate) fn of_set(diagnosis: &Diagnosis) -> String {

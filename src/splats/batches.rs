@@ -5,9 +5,10 @@
 
 use std::ops::Range;
 
+use nightsplat_models::attributes::{Attribute, AttributePlane, PlaneCounts, planes};
+
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Slice, SliceMut};
-use crate::splats::attributes::{Attribute, AttributePlane, PlaneCounts, planes};
 use crate::splats::packed_sh::StorageFormat;
 
 /// The layout of planes in a buffer.

@@ -12,17 +12,17 @@
 mod control;
 
 use nightsplat_core::camera::{Camera, Patch};
+use nightsplat_models::attributes::PlaneCounts;
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Threads};
 use crate::kernels::densify_action::{
     COUNTER_CANDIDATES, COUNTER_CLONED, COUNTER_PRUNED, COUNTER_SPLIT, COUNTER_WORDS,
 };
 use crate::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
-use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::{Batch, rest_by_column};
+use crate::splats::device::{DeviceGaussians, GaussianSlice, Layout};
 use crate::splats::optimizer::Moments;
 use crate::splats::packed_sh::StorageFormat;
-use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
 use crate::splats::sort::{Count, RadixSort, Scan};
 use crate::{Error, Result};
 pub use control::{DensityControl, DensityStrategy};

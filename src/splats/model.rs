@@ -5,14 +5,14 @@ use std::borrow::Cow;
 use glam::{DAffine3, DQuat};
 use nightsplat_core::camera::deviation_from_rigid;
 use nightsplat_core::curves::SceneLaw;
+use nightsplat_models::gaussians::{Features, Gaussians, ModelFacts};
 #[cfg(any(test, not(feature = "train")))]
-use nightsplat_core::input;
+use {
+    nightsplat_core::input, nightsplat_models::file_kind::FileKind,
+    nightsplat_models::gaussians::ply,
+};
 
 use crate::splats::render::RenderSettings;
-use crate::splats::scene::Features;
-#[cfg(any(test, not(feature = "train")))]
-use crate::splats::scene::ply;
-use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::{Error, Result};
 
 /// A model with what a renderer must know of it.
@@ -185,26 +185,6 @@ fn load_ply(path: &std::path::Path) -> Result<Model> {
             let (gaussians, facts) =
                 ply::parse(&bytes).map_err(|problem| Error::input(path, problem))?;
             Ok(Model::of_shown(gaussians, &facts))
-        }
-    }
-}
-
-/// The formats of model files.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum FileKind {
-    Ply,
-    Spz,
-    Sog,
-}
-
-impl FileKind {
-    /// By the first bytes.
-    pub(crate) fn from_bytes(bytes: &[u8]) -> Option<Self> {
-        match bytes {
-            [b'p', b'l', b'y', ..] => Some(Self::Ply),
-            [b'N', b'G', b'S', b'P', ..] | [0x1f, 0x8b, ..] => Some(Self::Spz),
-            [b'P', b'K', ..] => Some(Self::Sog),
-            _ => None,
         }
     }
 }

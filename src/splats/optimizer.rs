@@ -10,13 +10,14 @@ pub use schedule::{LearningRates, Schedule};
 
 use std::sync::OnceLock;
 
+use nightsplat_models::attributes::PlaneCounts;
+
 use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Slice, SliceMut, Threads};
 use crate::kernels::sh::MAX_SH_DEGREE;
 use crate::kernels::{self, adam, adam_gaussian};
-use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::{Batch, frozen_floats, rest_by_column};
+use crate::splats::device::Layout;
 use crate::splats::packed_sh::StorageFormat;
-use crate::splats::scene::Layout;
 use crate::{Error, Result};
 
 /// Adam's exponential moving averages of gradients and squared gradients: planes in the layout of the parameters, in

@@ -1,9 +1,9 @@
 //! SH coefficients above degree 0 in 16 bits, two per word of the planes, as in include/half.glsl.
 
+use nightsplat_models::attributes::PlaneCounts;
 use serde::{Deserialize, Serialize};
 
 use crate::kernels::half::{LARGEST_HALF, SMALLEST_HALF};
-use crate::splats::attributes::PlaneCounts;
 
 /// Storage format of trained numbers; arithmetic is in 32 bits.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -94,7 +94,7 @@ pub(crate) fn nearest(value: f32) -> u16 {
 #[cfg(test)]
 mod tests {
     use super::{PackedSh, nearest, value};
-    use crate::splats::attributes::{PlaneCounts, column_count};
+    use nightsplat_models::attributes::{PlaneCounts, column_count};
 
     #[test]
     fn every_half_is_restored_and_numbers_round_to_the_nearest() {

@@ -41,7 +41,7 @@ use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads, Tile};
 use crate::kernels::blend_forward::{DEPTH_MEAN, DEPTH_SUM};
 use crate::kernels::{self, blend_backward, blend_forward, emit, order_counts, project_backward};
 use crate::splats::batches::GradientKind;
-use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
+use crate::splats::device::{DeviceGaussians, GaussianSlice, Layout};
 use crate::{Error, Result};
 
 use bins::Sort;

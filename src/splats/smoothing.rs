@@ -5,7 +5,7 @@ use nightsplat_core::camera::{Camera, Patch};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{self, smoothing_floor};
-use crate::splats::scene::DeviceGaussians;
+use crate::splats::device::DeviceGaussians;
 
 /// Raises standard deviations to the smoothing floor.
 #[derive(Debug)]

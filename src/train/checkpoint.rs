@@ -10,6 +10,7 @@ use std::path::Path;
 use nightsplat_core::hash::{self, Hasher};
 use nightsplat_core::input;
 use nightsplat_core::output::write_whole_with;
+use nightsplat_models::gaussians::{Gaussians, Shape, width};
 use nightsplat_photographs::dataset::Fingerprint;
 use rayon::prelude::*;
 use safetensors::tensor::{Dtype, TensorView};
@@ -26,7 +27,6 @@ use crate::kernels::lamp::{LAMP_NUMBERS, LAMP_WIDTH};
 use crate::networks::TensorFile;
 use crate::splats::batches::Batches;
 use crate::splats::optimizer::{AdamBuffers, Moments};
-use crate::splats::scene::{Gaussians, Shape, width};
 use crate::{Error, Result};
 
 /// The metadata key of the [`CheckpointHeader`], as JSON; a single key, since several would be written in random order.

@@ -11,12 +11,13 @@
 
 use std::sync::Arc;
 
+use nightsplat_models::gaussians::ATTRIBUTES;
+
 use super::batching::Submissions;
 use super::config::TrainConfig;
 use super::decisions::{Decisions, HeldOutScore};
 use super::early_stopping::EndReason;
 use crate::splats::optimizer::LearningRates;
-use crate::splats::scene::ATTRIBUTES;
 
 /// Steps after a round of density control in which the held-out views are not scored.
 const SETTLING_DISTANCE: u64 = 50;

@@ -14,6 +14,9 @@ use nightsplat_core::camera::frame::{FRAME_EXTENT, TrainingFrame};
 use nightsplat_core::random::Stream;
 use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
+use nightsplat_models::attributes::Attribute;
+use nightsplat_models::gaussians::init::Initialization;
+use nightsplat_models::gaussians::{MAX_SH_DEGREE, ModelFacts, Shape};
 use nightsplat_photographs::dataset::{
     DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize, NormalOptions, PixelOrientation,
     RowBands,
@@ -30,14 +33,11 @@ use super::streams;
 use crate::gpu::Tile;
 use crate::loss::{LossConfig, ParameterWeights};
 use crate::networks::NetworkVariant;
-use crate::splats::attributes::Attribute;
 use crate::splats::densify::DensityControl;
 use crate::splats::lamp::Lamp;
 use crate::splats::optimizer::Schedule;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::RenderSettings;
-use crate::splats::scene::init::Initialization;
-use crate::splats::scene::{MAX_SH_DEGREE, ModelFacts, Shape};
 use crate::{Error, Result};
 pub use antialiasing::AntialiasingConfig;
 pub use exposure::ExposureConfig;

@@ -1,13 +1,13 @@
 //! The Gaussians that a training starts from: those that it trains, and around a block those that it renders alone.
 
 use nightsplat_core::camera::Camera;
+use nightsplat_models::gaussians::Gaussians;
+use nightsplat_models::joined::{MANIFEST, TileManifest};
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::dataset::block::{Block, Cell};
 use rayon::prelude::*;
 
 use super::config::TrainConfig;
-use crate::splats::joined::{MANIFEST, TileManifest};
-use crate::splats::scene::Gaussians;
 use crate::{Error, Result};
 
 /// A Gaussian counts as seen up to this far beyond the edges of an image, in widths and heights of the image: it may

@@ -7,6 +7,9 @@
 use glam::{DVec2, DVec3, Vec3};
 use nightsplat_core::camera::{Camera, Patch};
 use nightsplat_core::random::Stream;
+use nightsplat_models::attributes::{AttributePlane, planes};
+use nightsplat_models::gaussians::init::Initialization;
+use nightsplat_models::gaussians::{Gaussians, SH_C0, width};
 use nightsplat_photographs::image::Image;
 
 use super::clock::RunClock;
@@ -20,12 +23,10 @@ use super::views::{TrainView, Views};
 use crate::Result;
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
-use crate::splats::attributes::{AttributePlane, planes};
+use crate::splats::device::Upload;
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
-use crate::splats::scene::init::Initialization;
-use crate::splats::scene::{Gaussians, SH_C0, width};
 
 /// The most views that are sampled.
 const VIEWS: usize = 16;
@@ -253,8 +254,8 @@ mod tests {
     use glam::DAffine3;
 
     use super::*;
-    use crate::splats::scene::{Features, Shape};
     use nightsplat_core::camera::CameraModel;
+    use nightsplat_models::gaussians::{Features, Shape};
 
     fn camera(width: u32, height: u32) -> Camera {
         let (focal, principal_point) = (DVec2::splat(2.0), DVec2::new(1.0, 0.5));

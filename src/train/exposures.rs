@@ -7,11 +7,11 @@ use nightsplat_photographs::dataset::{Dataset, LoadOptions, Photograph, View};
 use nightsplat_photographs::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
 
 use super::config::TrainConfig;
-use super::diagnose::exposures_at_points;
 use super::views::Views;
 use crate::loss::exposure::{Affine, table};
 use crate::targets::Targets;
 use crate::{Error, Result};
+use nightsplat_diagnose::exposures_at_points;
 
 /// The stops of linear light by which photographs are brighter than the mean of the training views, by view: from the
 /// table of the configuration or the dataset, else from EXIF. Empty where no exposure is known, or all are alike.

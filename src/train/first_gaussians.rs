@@ -7,6 +7,7 @@ use std::path::Path;
 use glam::{DVec3, Vec3};
 use nightsplat_core::camera::{Camera, Patch, TrainingFrame};
 use nightsplat_core::random::Stream;
+use nightsplat_models::gaussians::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
 use nightsplat_photographs::dataset::{Dataset, Point, View};
 use nightsplat_photographs::image::Image;
 
@@ -17,7 +18,6 @@ use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::NetworkVariant;
 use crate::splats::lamp::Lamp;
-use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
 use crate::targets::pseudo_gt::PseudoGt;
 use crate::{Error, Result};
 

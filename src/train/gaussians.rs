@@ -1,14 +1,16 @@
 //! The Gaussians in training, on the device, with their moments and gradients.
 
+use nightsplat_models::attributes::{AttributePlane, PlaneCounts, planes};
+use nightsplat_models::gaussians::{Gaussians, Shape};
+
 use super::precision::PrecisionConfig;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::loss::{LogSlot, ParameterTerms};
-use crate::splats::attributes::{AttributePlane, PlaneCounts, planes};
 use crate::splats::batches::{Batches, GradientKind};
 use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, Round};
+use crate::splats::device::{DeviceGaussians, GaussianSlice, Layout, Upload};
 use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, GaussianStep, Moments};
-use crate::splats::scene::{DeviceGaussians, GaussianSlice, Gaussians, Layout, Shape};
 
 /// Planes of every attribute with their moments and gradients, and the statistics of density control. Buffers may be
 /// longer than the Gaussians need.
@@ -259,7 +261,7 @@ mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
     use crate::splats::packed_sh::StorageFormat;
-    use crate::splats::scene::Features;
+    use nightsplat_models::gaussians::Features;
 
     #[test]
     fn another_sh_degree_keeps_the_moments_of_the_columns_that_are_trained() {

@@ -10,8 +10,8 @@ use super::rendered::Rendered;
 use super::trainer::Trainer;
 use crate::Result;
 use crate::splats::densify::{DensifyReport, Round};
+use crate::splats::device::GaussianSlice;
 use crate::splats::render::RenderOptions;
-use crate::splats::scene::GaussianSlice;
 
 /// The most dB that a round may cost on the probes before it is repeated with fewer splits. The training views as a
 /// whole may lose somewhat more.

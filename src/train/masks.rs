@@ -3,13 +3,13 @@
 
 use glam::UVec2;
 use nightsplat_core::camera::Camera;
+use nightsplat_models::gaussians::COLOR_CHANNELS;
 use nightsplat_photographs::dataset::Dataset;
 
 use super::views::{TrainingView, Views};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{mask_gradient, mask_render};
-use crate::splats::scene::COLOR_CHANNELS;
 
 /// The masks of the views and the kernels that apply them; a view without a mask costs nothing.
 #[derive(Debug)]

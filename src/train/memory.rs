@@ -6,6 +6,7 @@
 use std::sync::Arc;
 
 use nightsplat_core::camera::Patch;
+use nightsplat_models::gaussians::Shape;
 use serde::Serialize;
 
 use super::cache::CacheSize;
@@ -16,8 +17,8 @@ use super::model::{MARGIN, TrainedModel};
 use super::views::Views;
 use crate::Result;
 use crate::gpu::Gpu;
+use crate::splats::device::Layout;
 use crate::splats::render::RenderOptions;
-use crate::splats::scene::{Layout, Shape};
 
 /// Approximate host memory of the program, the driver and its compiled kernels.
 const PROGRAM: f64 = 256.0 * 1024.0 * 1024.0;

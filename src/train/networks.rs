@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use glam::UVec2;
+use nightsplat_models::gaussians::{COLOR_CHANNELS, Feature, Features};
 use nightsplat_photographs::image::Image;
 
 use super::parts::ModelConfig;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::networks::crop::{CropKernels, PaddedCrop};
 use crate::networks::{self, Denoiser, Parameters, Tonemapper};
-use crate::splats::scene::{COLOR_CHANNELS, Feature, Features};
 use crate::{Error, Result};
 
 /// The networks of a model, and the crop of the render that is their input.

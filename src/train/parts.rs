@@ -7,11 +7,11 @@ use glam::UVec2;
 use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
 
+use nightsplat_models::gaussians::Features;
 use nightsplat_photographs::dataset::NormalAxes;
 
 use crate::loss::{DepthBoxes, Weights};
 use crate::networks::{Denoiser, DenoiserSettings, NetworkVariant, Tonemapper};
-use crate::splats::scene::Features;
 use crate::{Error, Result};
 
 /// Named models.

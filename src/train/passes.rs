@@ -1,6 +1,7 @@
 //! The kernels of a step.
 
 use nightsplat_core::random::Stream;
+use nightsplat_models::gaussians::Shape;
 use nightsplat_photographs::dataset::Dataset;
 
 use super::config::{Background, TrainConfig};
@@ -12,7 +13,6 @@ use crate::splats::batches::GradientKind;
 use crate::splats::densify::{Densifier, DensifySettings};
 use crate::splats::optimizer::{Adam, FiniteCheck};
 use crate::splats::render::{RenderSettings, Renderer};
-use crate::splats::scene::Shape;
 use crate::splats::smoothing::SmoothingFloor;
 
 /// Kernels that depend only on the device and the settings.

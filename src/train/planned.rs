@@ -6,13 +6,14 @@ use nightsplat_photographs::dataset::{Dataset, LoadOptions};
 use toml::Value;
 
 use super::config::TrainConfig;
-use super::diagnose::{Diagnosis, Plan, PlannedPart};
 use super::layers::{Origin, Settings, SettingsLayer};
+use super::plan::{Plan, PlannedPart};
 use super::preset::Preset;
 use super::trainer::Trainer;
 use crate::gpu::Gpu;
 use crate::targets::external::ExternalTargets;
 use crate::{Error, Result};
+use nightsplat_diagnose::Diagnosis;
 
 /// Requested settings of a run in addition to its plan, from the lowest precedence to the highest.
 #[derive(Clone, Debug, Default)]

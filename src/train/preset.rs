@@ -174,11 +174,11 @@ mod tests {
     use super::*;
     use crate::loss::Weights;
     use crate::networks::NetworkVariant;
-    use crate::splats::attributes::Attribute;
     use crate::splats::densify::DensityControl;
     use crate::splats::optimizer::Schedule;
-    use crate::splats::scene::init::Initialization;
     use crate::train::{DensityConfig, ModelConfig};
+    use nightsplat_models::attributes::Attribute;
+    use nightsplat_models::gaussians::init::Initialization;
     use nightsplat_photographs::tone::ToneSettings;
 
     fn applied(preset: Preset, scene: &str, curve: impl Into<Tone>) -> TrainConfig {

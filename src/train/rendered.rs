@@ -5,8 +5,8 @@ use nightsplat_photographs::image::Image;
 
 use super::networks::Networks;
 use crate::Result;
+use crate::splats::device::{GaussianSlice, Layout};
 use crate::splats::render::{RenderOptions, Renderer};
-use crate::splats::scene::{GaussianSlice, Layout};
 
 /// The render of a view.
 #[derive(Clone, Debug)]

@@ -4,6 +4,7 @@ use std::sync::LazyLock;
 
 use nightsplat_core::camera::TrainingFrame;
 use nightsplat_core::settings::{Rule, Setting, distance};
+use nightsplat_models::gaussians::init::Initialization;
 use nightsplat_photographs::tone::ToneSettings;
 use toml::{Table, Value};
 
@@ -18,7 +19,6 @@ use crate::loss::exposure::ExposureRates;
 use crate::loss::{ParameterWeights, Weights};
 use crate::networks::DenoiserSettings;
 use crate::splats::optimizer::{LearningRates, Schedule};
-use crate::splats::scene::init::Initialization;
 
 /// Every setting, in the order of config.toml.
 pub static SETTINGS: LazyLock<Vec<Setting>> = LazyLock::new(|| {

@@ -8,6 +8,7 @@ use std::thread::{self, ScopedJoinHandle};
 use glam::UVec2;
 use nightsplat_core::camera::CameraModel;
 use nightsplat_core::watch::Watch;
+use nightsplat_models::gaussians::{FEATURES, Gaussians, Shape, ply};
 use nightsplat_photographs::dataset::{Dataset, Fingerprint, Original, Split, View};
 use nightsplat_photographs::scene_tone::SceneTone;
 
@@ -30,7 +31,6 @@ use super::views::Views;
 use crate::gpu::Gpu;
 use crate::loss::exposure::Exposures;
 use crate::loss::{LossLog, ParameterTerms};
-use crate::splats::scene::{FEATURES, Gaussians, Shape, ply};
 use crate::targets::Targets;
 use crate::{Error, Result};
 

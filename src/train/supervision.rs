@@ -6,6 +6,8 @@
 //! render and features -> networks -> their terms -------------------------------------------------^
 //! ```
 
+use nightsplat_models::gaussians::Features;
+
 use super::gaussians::TrainedGaussians;
 use super::masks::Masks;
 use super::networks::Networks;
@@ -18,7 +20,6 @@ use crate::loss::exposure::{Affine, Exposures};
 use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, TermInputs};
 use crate::splats::optimizer::{Adam, Learnable};
 use crate::splats::render::Renderer;
-use crate::splats::scene::Features;
 use crate::targets::Targets;
 
 /// The training views with their targets, and the terms of the loss.

@@ -2,6 +2,7 @@
 
 use glam::UVec2;
 use nightsplat_core::random::Stream;
+use nightsplat_models::gaussians::{COLOR_CHANNELS, Feature};
 
 use super::config::TrainConfig;
 use super::masks::Masking;
@@ -15,7 +16,6 @@ use crate::loss::{
 };
 use crate::networks::crop::PaddedCrop;
 use crate::networks::{Denoiser, NetworkVariant};
-use crate::splats::scene::{COLOR_CHANNELS, Feature};
 use crate::{Error, Result};
 
 /// The images of a view that are targets of the networks, (3, H, W) each.

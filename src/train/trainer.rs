@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use glam::DAffine3;
 use nightsplat_core::camera::{Camera, TrainingFrame};
+use nightsplat_models::gaussians::{Gaussians, ModelFacts};
 use nightsplat_photographs::dataset::{Dataset, Fingerprint};
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::SceneLaw;
@@ -25,7 +26,6 @@ use crate::loss::exposure::Affine;
 use crate::splats::lamp::Lamp;
 use crate::splats::optimizer::{AdamStep, GaussianStep, LearningRates};
 use crate::splats::render::{Damping, Gradients, Instance, Purpose, RenderOptions, RenderSettings};
-use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::{Error, Result, splats};
 
 /// The interval of the smoothing floor, which visits every camera; scales change by at most 8 % in between.

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use glam::UVec2;
 use nightsplat_core::camera::Patch;
 use nightsplat_core::watch::Stage;
+use nightsplat_models::gaussians::COLOR_CHANNELS;
 use nightsplat_photographs::dataset::{Dataset, NormalMap};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::scene_tone::photographs;
@@ -20,7 +21,6 @@ use crate::gpu::{Buffer, Download, Recorder};
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
 use crate::splats::render::{Viewpoint, Viewpoints};
-use crate::splats::scene::COLOR_CHANNELS;
 use crate::targets::Targets;
 use crate::targets::pseudo_gt::PseudoGt;
 

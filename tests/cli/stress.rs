@@ -14,12 +14,12 @@ use nightsplat::gpu::CheckReport;
 use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::gaussian::Planes;
 use nightsplat::reference::project::{ProjectionSettings, project_gaussian};
-use nightsplat::splats::scene::ATTRIBUTES;
 use nightsplat::{kernels, reference};
 use nightsplat_core::camera::Patch;
 
 use cases::{CASES, Case, Effort, Expect};
 use hostile::Hostile;
+use nightsplat_models::gaussians::ATTRIBUTES;
 
 use crate::common::prelude::*;
 

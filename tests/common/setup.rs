@@ -11,13 +11,14 @@ use nightsplat::reference::camera::{ReferenceCamera, ReferenceLens};
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
 use nightsplat::splats::batches::{Batches, GradientKind};
+use nightsplat::splats::device::{DeviceGaussians, Upload};
 use nightsplat::splats::lamp::Lamp;
 use nightsplat::splats::optimizer::{
     Adam, AdamBuffers, AdamStep, GaussianStep, LearningRates, Moments,
 };
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
-use nightsplat::splats::scene::{DeviceGaussians, Features, Gaussians, Shape};
 use nightsplat_core::camera::{self, CameraModel, KannalaBrandt, Patch};
+use nightsplat_models::gaussians::{Features, Gaussians, Shape};
 use nightsplat_photographs::tone::Profile;
 
 use super::Random;

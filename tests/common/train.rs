@@ -1,8 +1,8 @@
 //! Small datasets, and training on them.
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{StepReport, TrainConfig, Trainer};
+use nightsplat_models::gaussians::Gaussians;
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_synth::SyntheticOptions;
 

@@ -18,13 +18,14 @@ use nightsplat::gpu::{
 };
 use nightsplat::kernels::{depth_limits, pack_pixels, pixels};
 use nightsplat::reference::pack_pixels as pack_pixels_reference;
+use nightsplat::splats::device::{DeviceGaussians, Upload};
 use nightsplat::splats::render::{
     DepthConvention, DepthKind, Purpose, RenderOptions, RenderSettings, Renderer, SceneDepth,
     Target,
 };
-use nightsplat::splats::scene::{DeviceGaussians, Gaussians};
 use nightsplat_core::camera::{Camera, CameraModel};
 use nightsplat_core::random::Stream;
+use nightsplat_models::gaussians::Gaussians;
 
 use crate::common::{Random, not_run};
 use crate::host::{Host, Picture, usual_extensions, with_host};

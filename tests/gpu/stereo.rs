@@ -7,6 +7,7 @@ use std::io::Cursor;
 use ash::vk;
 use ash::vk::Handle as _;
 use nightsplat::gpu::{HostFrame, ImageFormat, ImageState};
+use nightsplat::splats::device::Upload;
 use nightsplat::splats::render::{RenderSettings, Renderer};
 
 use crate::host::{Host, Picture, with_host};

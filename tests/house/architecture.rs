@@ -83,7 +83,8 @@ fn the_list_of_layers_names_every_module_once() {
 
 #[test]
 fn a_folder_of_modules_lists_each_on_its_page() {
-    let crates = ["core", "photographs", "report"].map(|name| format!("crates/{name}/src/lib.rs"));
+    let crates = ["core", "diagnose", "models", "photographs", "pose", "report"]
+        .map(|name| format!("crates/{name}/src/lib.rs"));
     for folder in
         crates.into_iter().chain(["splats", "results"].map(|name| format!("src/{name}.rs")))
     {
@@ -240,7 +241,7 @@ fn a_clock_that_jumps_changes_nothing_but_the_dates_of_event_files_and_which_fil
     // A changed time stamp costs only a checksum of the pixels, another look at a model, or a new search for cameras.
     let may_ask = [
         "crates/photographs/src/tree.rs",
-        "src/pose/origin.rs",
+        "crates/pose/src/origin.rs",
         "src/results/run/tail.rs",
         "crates/report/src/tensorboard.rs",
     ];

@@ -7,8 +7,8 @@ use nightsplat::kernels::{
     DepthGradient, DepthMoments, depth_boxes, depth_correlation, depth_gradient, depth_moments,
 };
 use nightsplat::loss::{DepthBoxes, DepthLoss, LossTerm as _, Term};
-use nightsplat::splats::scene::Features;
 use nightsplat_core::random::Stream;
+use nightsplat_models::gaussians::Features;
 
 use super::{
     Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,

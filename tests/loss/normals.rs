@@ -6,7 +6,7 @@ use nightsplat::kernels::map_normal::NO_NORMAL;
 use nightsplat::kernels::{Camera, normals, normals_backward};
 use nightsplat::loss::{LossTerm as _, NormalLoss, Term};
 use nightsplat::reference::normals::{map_normal, normal_loss, pixel_ray};
-use nightsplat::splats::scene::Features;
+use nightsplat_models::gaussians::Features;
 use nightsplat_photographs::dataset::NormalMap;
 
 use super::{

@@ -1,12 +1,13 @@
 //! The terms on parameters.
 
+use nightsplat_models::attributes::{Attribute, PlaneCounts, column_count};
+
 use nightsplat::gpu::Buffer;
 use nightsplat::kernels::parameter_terms;
 use nightsplat::loss::{ParameterTerms, ParameterWeights, Term};
 use nightsplat::reference::parameter_terms::parameter_terms;
-use nightsplat::splats::attributes::{Attribute, PlaneCounts, column_count};
 use nightsplat::splats::batches::Batches;
-use nightsplat::splats::scene::GaussianSlice;
+use nightsplat::splats::device::GaussianSlice;
 
 use super::{assert_close, central_differences, log_step};
 use crate::common::prelude::*;

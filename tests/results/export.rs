@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use nightsplat::glam::Vec3;
-use nightsplat::splats::scene::{Gaussians, ply};
 use nightsplat_core::random::Stream;
+use nightsplat_models::gaussians::{Gaussians, ply};
 
 use crate::common::command::{Folder, json, says};
 

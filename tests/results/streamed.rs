@@ -2,10 +2,10 @@
 
 use std::io::{Cursor, Write as _};
 
-use nightsplat::results::export::Provenance;
-use nightsplat::results::export::streamed::{self, Division, INDEX, TileLoader, Written};
-use nightsplat::splats::levels::level;
 use nightsplat::splats::model::Model;
+use nightsplat_models::export::Provenance;
+use nightsplat_models::export::streamed::{self, Division, INDEX, TileLoader, Written};
+use nightsplat_models::levels::level;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
 use crate::common::command::{Folder, refused, succeed};

@@ -1,7 +1,8 @@
 //! More Gaussians than one binding can hold: passes in batches, with the same bits.
 
+use nightsplat_models::gaussians::width;
+
 use nightsplat::gpu::testing::gpu_that_binds;
-use nightsplat::splats::scene::width;
 
 use crate::common::not_run;
 use crate::common::prelude::*;

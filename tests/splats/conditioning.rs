@@ -8,8 +8,8 @@ use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::rounding::UNIT;
 use nightsplat::reference::splat::Splat;
-use nightsplat::splats::attributes::{AttributePlane, PlaneCounts, planes};
 use nightsplat::splats::optimizer::{Adam, AdamBuffers, AdamStep, LearningRates};
+use nightsplat_models::attributes::{AttributePlane, PlaneCounts, planes};
 use nightsplat_photographs::tone::percentiles;
 
 use crate::common::prelude::*;

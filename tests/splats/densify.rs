@@ -7,7 +7,7 @@ use glam::Quat;
 use nightsplat::splats::densify::{
     Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, Round,
 };
-use nightsplat::splats::scene::DeviceGaussians;
+use nightsplat::splats::device::DeviceGaussians;
 
 use host::{COLUMNS, CONSERVING, Host, LAST, SETTINGS, camera_at, room_for, shape};
 

@@ -3,8 +3,8 @@
 use nightsplat::gpu::{Buffer, Recorder};
 use nightsplat::kernels;
 use nightsplat::splats::batches::Batches;
+use nightsplat::splats::device::DeviceGaussians;
 use nightsplat::splats::optimizer::{Adam, AdamBuffers, AdamStep, GaussianStep, LearningRates};
-use nightsplat::splats::scene::DeviceGaussians;
 use nightsplat_core::camera::Patch;
 
 use crate::common::prelude::*;

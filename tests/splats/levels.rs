@@ -2,9 +2,9 @@
 
 use glam::Quat;
 use nightsplat::reference::densify_scatter::{ChildGaussian as Split, half_of};
-use nightsplat::splats::levels::{Cells, coarser, level};
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::rest_coefficients;
+use nightsplat_models::gaussians::rest_coefficients;
+use nightsplat_models::levels::{Cells, coarser, level};
 use nightsplat_photographs::metrics::psnr;
 
 use crate::common::prelude::*;

@@ -2,11 +2,11 @@
 
 use nightsplat::gpu::{Buffer, Reference};
 use nightsplat::kernels::adam;
-use nightsplat::splats::attributes::Attribute;
-use nightsplat::splats::attributes::PlaneCounts;
 use nightsplat::splats::optimizer::{
     Adam, AdamBuffers, AdamStep, FiniteCheck, LearningRates, Schedule,
 };
+use nightsplat_models::attributes::Attribute;
+use nightsplat_models::attributes::PlaneCounts;
 
 use crate::common::prelude::*;
 

@@ -2,10 +2,12 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use nightsplat_models::gaussians::width;
+
 use nightsplat::gpu::testing::gpu_that_binds;
+use nightsplat::splats::device::DeviceGaussians;
 use nightsplat::splats::optimizer::LearningRates;
 use nightsplat::splats::render::{Damping, Gradients};
-use nightsplat::splats::scene::{DeviceGaussians, width};
 use nightsplat::train::PrecisionConfig;
 
 use crate::common::own_gpu;

@@ -10,7 +10,7 @@ use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
 use nightsplat::reference::splat::{Splat, splat_columns};
 use nightsplat::splats::lamp::Lamp;
 use nightsplat::splats::render::Status;
-use nightsplat::splats::scene::Attribute;
+use nightsplat_models::gaussians::Attribute;
 
 use crate::common::chain::Chain;
 use crate::common::prelude::*;

@@ -1,9 +1,9 @@
 //! Gaussians on the host: their table, their initialisation, their file.
 
 use glam::Quat;
-use nightsplat::splats::attributes::planes;
-use nightsplat::splats::scene::init::Initialization;
-use nightsplat::splats::scene::{ATTRIBUTES, SH_C0, init, rest_coefficients, width};
+use nightsplat_models::attributes::planes;
+use nightsplat_models::gaussians::init::Initialization;
+use nightsplat_models::gaussians::{ATTRIBUTES, SH_C0, init, rest_coefficients, width};
 use nightsplat_photographs::dataset::{Point, View};
 
 use crate::common::prelude::*;

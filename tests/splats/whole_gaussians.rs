@@ -1,6 +1,7 @@
 //! Adam over whole Gaussians: its guards, in every format.
 
-use nightsplat::splats::attributes::Attribute;
+use nightsplat_models::attributes::Attribute;
+
 use nightsplat::splats::optimizer::LearningRates;
 
 use crate::common::prelude::*;

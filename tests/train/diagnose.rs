@@ -5,9 +5,10 @@ use std::fs;
 use std::path::Path;
 
 use nightsplat::gpu::Gpu;
-use nightsplat::train::diagnose::{Diagnosis, Plan};
+use nightsplat::train::plan::Plan;
 use nightsplat::train::{Preset, TrainConfig, Trainer};
 use nightsplat_core::random::Stream;
+use nightsplat_diagnose::Diagnosis;
 use nightsplat_photographs::dataset::{Dataset, DepthOptions, LoadOptions};
 use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
 use nightsplat_synth::{Capture, Night, SyntheticOptions};

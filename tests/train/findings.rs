@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use nightsplat::train::diagnose::Diagnosis;
+use nightsplat_diagnose::Diagnosis;
 use nightsplat_photographs::dataset::{Dataset, LoadOptions, RowBands, View};
 use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
 use nightsplat_synth::{Capture, SyntheticOptions};

@@ -1,9 +1,9 @@
 //! A lamp that moves with the camera is told from the surfaces that it lights.
 
 use nightsplat::splats::lamp::Lamp;
-use nightsplat::splats::scene::init::Initialization;
 use nightsplat::targets::Targets;
 use nightsplat::train::Part;
+use nightsplat_models::gaussians::init::Initialization;
 use nightsplat_photographs::dataset::{Point, View};
 
 use crate::common::command::{refused, run, says, succeed};

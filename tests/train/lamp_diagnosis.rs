@@ -1,6 +1,7 @@
 //! A lamp that moves with the camera is told apart from everything else that makes a point differ between its views.
 
-use nightsplat::train::diagnose::{Diagnosis, LampDiagnosis, Plan, SceneDiagnosis};
+use nightsplat::train::plan::Plan;
+use nightsplat_diagnose::{Diagnosis, LampDiagnosis, SceneDiagnosis};
 use nightsplat_photographs::dataset::LoadOptions;
 use nightsplat_photographs::image::srgb_from_linear;
 

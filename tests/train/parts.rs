@@ -1,9 +1,9 @@
 //! The parts of LITA-GS: each alone and all together, trained, saved, and rendered.
 
 use nightsplat::loss::Term;
-use nightsplat::splats::attributes::{ATTRIBUTES, Attribute, AttributeSpec};
 use nightsplat::splats::model::Model;
 use nightsplat::train::{Part, Rendered, StepReport};
+use nightsplat_models::attributes::{ATTRIBUTES, Attribute, AttributeSpec};
 use nightsplat_photographs::dataset::NormalMap;
 
 use crate::common::command::{Folder, json, says};

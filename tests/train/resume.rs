@@ -1,8 +1,8 @@
 //! Interrupted runs that are resumed.
 
 use nightsplat::results::run::{self, Event, IfExists};
-use nightsplat::splats::scene::Attribute;
 use nightsplat::train::{Background, EndReason, Part, StepReport};
+use nightsplat_models::gaussians::Attribute;
 use nightsplat_photographs::dataset::View;
 use safetensors::SafeTensors;
 

@@ -2,13 +2,15 @@
 
 use std::ffi::c_char;
 
+use nightsplat_models::gaussians::{Gaussians, width};
+
 use super::camera::affine;
 use super::device::NspDevice;
 use super::error::{Failure, NSP_ERROR_MEMORY, NSP_ERROR_NOT_FINITE, NspResult, Object, guard};
 use super::structs::{Sized0, destroy, give, object, text, write};
 use nightsplat::gpu::Gpu;
+use nightsplat::splats::device::{DeviceGaussians, Upload};
 use nightsplat::splats::model::Model;
-use nightsplat::splats::scene::{DeviceGaussians, Gaussians, width};
 
 /// A model on a device. Use it from one thread at a time.
 #[derive(Debug)]

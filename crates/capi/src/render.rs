@@ -6,8 +6,8 @@ use nightsplat::gpu::{HostFrame, ImageFormat};
 use nightsplat::splats::render::{
     DepthConvention, DepthKind, Instance, Motion, RenderOptions, SceneDepth, Target,
 };
-use nightsplat::splats::scene::MAX_SH_DEGREE;
 use nightsplat_core::camera::Camera;
+use nightsplat_models::gaussians::MAX_SH_DEGREE;
 
 use super::camera::NspCamera;
 use super::device::VkCommandBuffer;

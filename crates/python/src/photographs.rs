@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use nightsplat::synthetic::{self, SyntheticOptions};
 use nightsplat::targets::pseudo_gt::PseudoGt;
-use nightsplat::train::diagnose::{Diagnosis, Plan};
+use nightsplat_diagnose::Diagnosis;
+use nightsplat::train::plan::Plan;
 use nightsplat::train::diagnosed;
 use nightsplat::{Error, Image, ImageFile, Tone, TrainConfig};
 use nightsplat_photographs::scene_tone::SceneTone;

@@ -106,6 +106,7 @@ impl Report {
         self.tables.iter().map(NumberTable::html).collect()
     }
 
+    /// The charts as HTML, a figure each.
     pub fn charts_html(&self) -> String {
         let figure = |chart: &Chart| format!("<figure class=\"plot\">{}</figure>\n", chart.svg());
         let plots: String = self.charts.iter().map(figure).collect();

@@ -10,7 +10,7 @@ use host::{NEAR, SIZE};
 use nightsplat::glam::{DAffine3, DVec3};
 use nightsplat::{
     Camera, DepthConvention, DeviceChoice, DeviceGaussians, Gpu, Model, Purpose, RenderOptions,
-    RenderSettings, Renderer, SceneDepth, Target,
+    RenderSettings, Renderer, SceneDepth, Target, Upload,
 };
 
 /// A model on the device of a host. It is dropped before the host.

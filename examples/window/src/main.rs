@@ -20,7 +20,7 @@ use nightsplat::ash::vk;
 use nightsplat::ash::vk::Handle as _;
 use nightsplat::{
     Camera, DepthConvention, DeviceGaussians, Gpu, HostFrame, ImageState, Model, Purpose,
-    RenderOptions, RenderSettings, Renderer, SceneDepth, Target,
+    RenderOptions, RenderSettings, Renderer, SceneDepth, Target, Upload,
 };
 use winit::application::ApplicationHandler;
 use winit::dpi::{PhysicalPosition, PhysicalSize};

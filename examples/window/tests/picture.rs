@@ -9,7 +9,7 @@ use std::process::Command;
 
 use nightsplat::glam::{DVec2, DVec3, Vec3};
 use nightsplat::{
-    Camera, DeviceChoice, Gaussians, Gpu, Image, RenderOptions, RenderSettings, Renderer,
+    Camera, DeviceChoice, Gaussians, Gpu, Image, RenderOptions, RenderSettings, Renderer, Upload,
 };
 use scene::{Block, Orbit, Scene};
 

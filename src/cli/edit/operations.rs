@@ -5,8 +5,8 @@ use std::path::Path;
 use clap::parser::ValueSource;
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, Error, FromArgMatches};
 use glam::DVec3;
+use nightsplat_models::edit::operation::{Operation, Region, Scale};
 
-use crate::results::edit::{Operation, Region, Scale};
 use crate::results::run_export::up::Up;
 
 /// Operations in the order of the command line.

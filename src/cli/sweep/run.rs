@@ -11,7 +11,7 @@ use crate::cli::train::TrainArgs;
 use crate::results::run;
 use crate::results::sweep::{PRESET, SweepPoint, SweepRun};
 use crate::train::TrainConfig;
-use crate::train::diagnose::Plan;
+use crate::train::plan::Plan;
 use crate::{Error, Result};
 
 /// A run with the arguments of its training.

@@ -29,9 +29,9 @@ use crate::driver;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
 use crate::targets::Targets;
-use crate::train::diagnose::remarks_at_points;
 use crate::train::{RequestedSettings, TrainConfig};
 use crate::{Error, Result};
+use nightsplat_diagnose::remarks_at_points;
 
 /// Apply a tone curve to photographs, and measure the effect.
 #[derive(Clone, Debug, clap::Args)]
@@ -282,7 +282,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     let measured: Vec<MeasuredPhotograph> = set.measured.into_values().collect();
     let mut remarks = findings(&measured, exposure.as_ref(), near_white);
     if Dataset::is_at(&args.input) {
-        remarks.extend(remarks_at_points(&TrainConfig { dataset: args.input.clone(), ..config }));
+        remarks.extend(remarks_at_points(&args.input, config.load_options()));
     }
     let output = ToneOutput { curve: settings, with_reference, exposure, scene, remarks, views };
     if let (Some(page), Some(path)) = (page, &args.report) {

@@ -11,7 +11,7 @@ use crate::cli::settings::{
     CurveOptions, Selection, SettingOptions, push_curve, push_dataset, push_targets,
 };
 use crate::cli::words::{self, NamedValues};
-use crate::train::diagnose::Plan;
+use crate::train::plan::Plan;
 use crate::train::{
     ModelName, Origin, Part, Preset, RequestedSettings, SettingsLayer, TrainConfig,
 };

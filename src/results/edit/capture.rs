@@ -6,11 +6,12 @@ use std::path::Path;
 use glam::DVec3;
 use nightsplat_core::camera::Camera;
 use nightsplat_core::input;
+use nightsplat_models::edit::placement::Placement;
+use nightsplat_models::gaussians::{Gaussians, ModelFacts};
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::tone::ToneSettings;
 
-use super::placement::Placement;
 use crate::gpu::Gpu;
 use crate::results::eval::{
     After, Evaluation, Extras, Metric, ModelRenderer, ReferenceKind, ScoreReference,
@@ -19,7 +20,6 @@ use crate::results::finished_run::{FinishedRun, Opener};
 use crate::results::run;
 use crate::splats::model::Model;
 use crate::splats::render::RenderSettings;
-use crate::splats::scene::{Gaussians, ModelFacts};
 use crate::targets::Targets;
 use crate::train::TrainConfig;
 use crate::{Error, Result};

@@ -14,32 +14,23 @@
 use glam::Vec3;
 use nightsplat_core::camera::{Camera, Patch};
 use nightsplat_core::random::Stream;
+use nightsplat_models::edit::floaters::Evidence;
+use nightsplat_models::edit::placement::Placement;
+use nightsplat_models::gaussians::{
+    Attribute, COLOR_CHANNELS, Features, Gaussians, ModelFacts, SH_C0,
+};
 use nightsplat_photographs::dataset::View;
 use nightsplat_photographs::image::Image;
 
 use super::capture::ModelPhotographs;
-use super::placement::Placement;
 use crate::Result;
 use crate::loss::exposure::Affine;
+use crate::splats::device::{DeviceGaussians, Upload};
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer, ViewGradients};
-use crate::splats::scene::{
-    Attribute, COLOR_CHANNELS, DeviceGaussians, Features, Gaussians, ModelFacts, SH_C0,
-};
 
 /// Images of signs per view.
 const PROBES: usize = 2;
-
-/// What the training views say of each Gaussian, summed over them.
-#[derive(Clone, Debug)]
-pub(super) struct Evidence {
-    /// <render - target, 2 d>.
-    pub(super) product: Vec<f64>,
-    /// |d|^2.
-    pub(super) square: Vec<f64>,
-    /// The mean squared error of a value of the views.
-    pub(super) error: f64,
-}
 
 /// A model on the device in the frame of its dataset.
 pub(super) struct Measured<'a> {

@@ -4,12 +4,13 @@ use std::str::FromStr;
 
 use glam::{DQuat, DVec3, Vec3};
 use nightsplat_core::camera::Camera;
+use nightsplat_models::gaussians::{Feature, Features, Gaussians, SH_C0};
 use nightsplat_photographs::image::Image;
 
 use super::ModelRenderer;
 use crate::gpu::Gpu;
+use crate::splats::device::Upload;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
-use crate::splats::scene::{Feature, Features, Gaussians, SH_C0};
 use crate::train::Networks;
 use crate::{Error, Result};
 

@@ -29,6 +29,7 @@ use std::path::{Path, PathBuf};
 use nightsplat_core::csv;
 use nightsplat_core::lock::FolderLock;
 use nightsplat_core::output::{flush_to_disk, own_file, write_whole};
+use nightsplat_models::gaussians::{Gaussians, ply};
 use nightsplat_photographs::dataset::{Dataset, Split, View};
 use nightsplat_report::tensorboard::EventFile;
 
@@ -40,8 +41,7 @@ pub use super::progress::RunProgress;
 use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::loss::exposure::{Affine, table};
-use crate::splats::scene::{Gaussians, ply};
-use crate::train::diagnose::Plan;
+use crate::train::plan::Plan;
 use crate::train::{Networks, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
 

@@ -6,8 +6,7 @@
 //! ```
 
 use nightsplat_core::hash;
-
-use crate::splats::scene::{ATTRIBUTES, Gaussians};
+use nightsplat_models::gaussians::{ATTRIBUTES, Gaussians};
 
 /// The table with a line for `step`. Lines of this and later steps are removed: a resumed run repeats them.
 pub(super) fn extended(recorded: &str, step: u64, gaussians: &Gaussians) -> String {

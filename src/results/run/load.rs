@@ -6,6 +6,8 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::{csv, input};
+use nightsplat_models::gaussians::{Features, Gaussians, ply};
+use nightsplat_models::joined::TileManifest;
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::tone::CurveEnds;
 
@@ -14,9 +16,7 @@ use super::files::{EXPOSURES, LAMP, NETWORKS, PLAN, TARGET_EXPOSURE, VIEWS};
 use super::generations;
 use crate::gpu::Gpu;
 use crate::loss::exposure::{Affine, table};
-use crate::splats::joined::TileManifest;
 use crate::splats::lamp::Lamp;
-use crate::splats::scene::{Features, Gaussians, ply};
 use crate::train::{ModelConfig, Networks, TrainConfig};
 use crate::{Error, Result};
 

@@ -14,7 +14,7 @@ use super::meter::{ResourceMeter, ResourceUsage};
 use super::{Event, Requests, RunDirectory, RunSummary, done, generations, load};
 use crate::gpu::Gpu;
 use crate::results::eval::{self, Evaluation, Extras, ScoreReference, ScoredImages};
-use crate::train::diagnose::Plan;
+use crate::train::plan::Plan;
 use crate::train::{Ended, MemoryEstimate, Settings, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 

@@ -2,10 +2,11 @@
 
 use std::path::Path;
 
+use nightsplat_models::export::Format;
+use nightsplat_models::gaussians::Gaussians;
+use nightsplat_models::levels;
+
 use super::ExportOptions;
-use crate::results::export::Format;
-use crate::splats::levels;
-use crate::splats::scene::Gaussians;
 use crate::{Error, Result};
 
 /// A model with fewer Gaussians than this is no model.

@@ -2,22 +2,41 @@
 
 use glam::DVec3;
 use nightsplat_core::natural;
+use nightsplat_models::export::Provenance;
+use nightsplat_models::export::page::{Bookmark, ModelPage, PageImage, SharedGlsl, Sharing, moved};
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::Image;
 use nightsplat_photographs::tone::ToneCurve;
 use nightsplat_report::jpeg;
+use serde_json::json;
 
 use super::{ExportOptions, has_networks};
 use crate::Result;
 use crate::gpu::Gpu;
+use crate::kernels::camera_pinhole::JACOBIAN_MARGIN;
+use crate::kernels::lamp::{LAMP_FARTHEST, LAMP_KNEE, LAMP_LEFT, LAMP_NEAREST};
+use crate::kernels::splat::{ALPHA_MIN, DILATION};
 use crate::results::eval::ModelRenderer;
-use crate::results::export::Provenance;
-use crate::results::export::page::{Bookmark, ModelPage, PageImage, Sharing, moved};
 use crate::results::finished_run::{FinishedRun, is_model};
 use crate::results::run;
 use crate::splats::render::RenderSettings;
 use crate::targets::Targets;
 use crate::train::TrainConfig;
+
+/// What the viewer of a page has in common with the kernels.
+pub(crate) const SHARED_GLSL: SharedGlsl = SharedGlsl {
+    constants: &[
+        ("ALPHA_MIN", ALPHA_MIN),
+        ("ALPHA_MAX", RenderSettings::MAX_ALPHA as f64),
+        ("DILATION", DILATION),
+        ("JACOBIAN_MARGIN", JACOBIAN_MARGIN),
+        ("LAMP_NEAREST", LAMP_NEAREST),
+        ("LAMP_FARTHEST", LAMP_FARTHEST),
+        ("LAMP_KNEE", LAMP_KNEE),
+        ("LAMP_LEFT", LAMP_LEFT),
+    ],
+    harmonics: include_str!("../../../shaders-glsl/include/sh.glsl"),
+};
 
 /// The largest share of a page's bytes that photographs take where its size is limited.
 const PICTURES: f64 = 0.4;
@@ -64,7 +83,11 @@ impl ExportOptions<'_> {
             fingerprint: None,
             near: near.unwrap_or_else(|| RenderSettings::default().near).into(),
             up: self.up_of(config).unwrap_or_else(|| dataset.up()),
-            lamp: if is_model { None } else { run::load_lamp(self.source)? },
+            lamp: if is_model {
+                None
+            } else {
+                run::load_lamp(self.source)?.map(|lamp| json!(lamp))
+            },
         })
     }
 

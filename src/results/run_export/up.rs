@@ -3,9 +3,9 @@
 use std::str::FromStr;
 
 use glam::{DQuat, DVec3};
+use nightsplat_models::export::Format;
 
 use super::ExportOptions;
-use crate::results::export::Format;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 

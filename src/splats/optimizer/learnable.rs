@@ -1,9 +1,10 @@
 //! Learned parameters other than the Gaussians.
 
+use nightsplat_models::attributes::PlaneCounts;
+
 use super::{Adam, AdamBuffers, AdamStep, LearningRates};
 use crate::Result;
 use crate::gpu::{Buffer, Recorder};
-use crate::splats::attributes::PlaneCounts;
 
 /// Parameters that Adam trains at one learning rate and a checkpoint stores, such as those of a network.
 pub trait Learnable {

@@ -5,12 +5,12 @@ use std::ops::{Index, IndexMut};
 
 use nightsplat_core::settings;
 use nightsplat_core::settings::{Rule, Setting};
+use nightsplat_models::attributes::{ATTRIBUTES, Attribute};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::Result;
 use crate::kernels::sh::MAX_SH_DEGREE;
-use crate::splats::attributes::{ATTRIBUTES, Attribute};
 
 /// Adam's learning rate of each attribute, by its name in TOML; that of the means in world units.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -119,9 +119,10 @@ mod tests {
     use glam::DAffine3;
 
     use crate::gpu::{DeviceChoice, Gpu};
+    use crate::splats::device::Upload;
     use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
-    use crate::splats::scene::Gaussians;
     use nightsplat_core::camera::Camera;
+    use nightsplat_models::gaussians::Gaussians;
 
     /// With the sorts, whose memory is allocated with the first render.
     #[test]

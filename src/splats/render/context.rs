@@ -1,9 +1,11 @@
 //! Gaussians that are rendered with those of every view, and have no gradients.
 
+use nightsplat_models::gaussians::Gaussians;
+
 use super::Renderer;
 use crate::Result;
 use crate::splats::batches::ALIGNMENT;
-use crate::splats::scene::Gaussians;
+use crate::splats::device::Upload;
 
 /// Before the sigmoid: too transparent to be rendered.
 const INVISIBLE: f32 = -100.0;

@@ -7,7 +7,7 @@ use crate::Result;
 use crate::kernels::blend_forward::DEPTH_MEDIAN;
 use crate::kernels::pack_pixels::NOTHING_SEEN;
 use crate::splats::camera::model_number;
-use crate::splats::scene::DeviceGaussians;
+use crate::splats::device::DeviceGaussians;
 
 /// The median depth, of everything in view.
 const MEDIAN: DepthChannel = DepthChannel { kind: DEPTH_MEDIAN, has_limits: false };

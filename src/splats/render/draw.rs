@@ -17,7 +17,7 @@ use crate::kernels::blend_forward::{DEPTH_MEDIAN, DEPTH_SUM};
 use crate::kernels::status::STATUS_WORDS;
 use crate::kernels::{depth_limits, pack_pixels, photograph_light};
 use crate::splats::camera::model_number;
-use crate::splats::scene::{GaussianSlice, Layout};
+use crate::splats::device::{GaussianSlice, Layout};
 
 /// The outcome of the newest draw that is done.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,12 +1,13 @@
 //! Gradients of a view without a training: what each Gaussian adds to it.
 
 use nightsplat_core::camera::{Camera, Patch};
+use nightsplat_models::gaussians::{Attribute, Gaussians};
 
 use super::{Damping, Gradients, RenderOptions, Renderer};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::splats::batches::Batches;
-use crate::splats::scene::{Attribute, DeviceGaussians, Gaussians};
+use crate::splats::device::DeviceGaussians;
 
 /// Memory for the gradients of a set of Gaussians, and the host's sums of them.
 #[derive(Debug)]

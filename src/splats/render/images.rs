@@ -6,7 +6,7 @@ use nightsplat_core::image::Image;
 
 use super::{DepthChannel, RenderOptions, RenderSettings, Renderer, Status};
 use crate::Result;
-use crate::splats::scene::GaussianSlice;
+use crate::splats::device::GaussianSlice;
 
 impl Renderer {
     /// The patches in which a view is rendered: the whole view where the device can, else patches that fit.

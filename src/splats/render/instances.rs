@@ -11,8 +11,8 @@ use super::projection::{GROUP, Projected};
 use super::{KernelView, RenderSettings, Renderer};
 use crate::gpu::Recorder;
 use crate::kernels::{self, InstanceView};
+use crate::splats::device::{DeviceGaussians, GaussianBounds, GaussianSlice, Layout};
 use crate::splats::packed_sh::StorageFormat;
-use crate::splats::scene::{DeviceGaussians, GaussianBounds, GaussianSlice, Layout};
 use crate::{Error, Result};
 
 /// A model in a draw, which may have others, and itself again elsewhere. The Gaussians are shared: nothing is copied.

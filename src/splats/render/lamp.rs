@@ -6,8 +6,8 @@ use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Slice, Threads, Tile};
 use crate::kernels::lamp::{LAMP_NUMBERS, LAMP_WIDTH};
 use crate::kernels::{lamp_backward, lamp_gradient};
 use crate::splats::batches::Batches;
+use crate::splats::device::GaussianSlice;
 use crate::splats::lamp::Lamp;
-use crate::splats::scene::GaussianSlice;
 
 const WIDTH: usize = LAMP_WIDTH as usize;
 

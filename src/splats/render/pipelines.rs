@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use nightsplat_core::camera::CameraModel;
+use nightsplat_models::gaussians::Shape;
 
 use super::buffers::{RANKS_PER_PARTITION, RenderBuffers, Segments};
 use super::lamp::DeviceLamp;
@@ -19,7 +20,6 @@ use crate::splats::batches::{GradientKind, rest_by_column};
 use crate::splats::camera::model_number;
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
-use crate::splats::scene::Shape;
 use crate::{Error, Result};
 
 impl Renderer {

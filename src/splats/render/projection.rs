@@ -11,7 +11,7 @@ use crate::Result;
 use crate::gpu::{Gpu, Kernel as _, Recorder, Threads};
 use crate::kernels::project;
 use crate::splats::batches::Batch;
-use crate::splats::scene::{DeviceGaussians, GaussianSlice};
+use crate::splats::device::{DeviceGaussians, GaussianSlice};
 
 /// Invocations of a workgroup of `project`.
 pub(super) const GROUP: u32 = project::Kernel::INTERFACE.workgroup_size[0];

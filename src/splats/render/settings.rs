@@ -1,11 +1,11 @@
 //! The settings of a renderer, and the tile that suits a device.
 
 use nightsplat_core::curves::SceneLaw;
+use nightsplat_models::gaussians::{Features, Shape};
 
 use crate::gpu::{Gpu, Properties, Sorting, Tile};
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
-use crate::splats::scene::{Features, Shape};
 use crate::{Error, Result};
 
 /// Specialization of a renderer.
@@ -27,7 +27,7 @@ pub struct RenderSettings {
     /// What [`Target::is_photograph`](crate::Target::is_photograph) inverts.
     pub law: Option<SceneLaw>,
     /// The storage format of the SH coefficients above degree 0: 32 bits after
-    /// [`Gaussians::upload`](crate::splats::scene::Gaussians::upload) and by default, 16
+    /// [`Upload::upload`](crate::splats::device::Upload::upload) and by default, 16
     /// where the training configuration sets it.
     pub rest: StorageFormat,
     /// Stop-gradient: the noise and illumination channels do not affect means, scales, rotations and opacities; depth
@@ -58,11 +58,16 @@ pub enum Purpose {
     Show,
 }
 
+impl RenderSettings {
+    /// The largest alpha of a splat where none is stated.
+    pub(crate) const MAX_ALPHA: f32 = 0.99;
+}
+
 impl Default for RenderSettings {
     fn default() -> Self {
         Self {
             near: 0.2,
-            max_alpha: 0.99,
+            max_alpha: Self::MAX_ALPHA,
             shape: 3.into(),
             raw_colors: false,
             antialiased: false,

@@ -3,10 +3,10 @@
 use std::fmt;
 use std::str::FromStr;
 
+use nightsplat_models::attributes::{ATTRIBUTES, Attribute, AttributeSpec, Width};
 use serde::{Deserialize, Serialize};
 
 use crate::Error;
-use crate::splats::attributes::{ATTRIBUTES, Attribute, AttributeSpec, Width};
 
 /// Attributes of the given Gaussians that are not trained.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -1,6 +1,7 @@
 //! One sort for the eyes of a headset, against a sort for each.
 
 use glam::DQuat;
+use nightsplat::splats::device::Upload;
 use nightsplat::splats::render::Instance;
 use nightsplat_core::camera::KannalaBrandt;
 

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use glam::{DQuat, Vec4};
 use nightsplat::kernels::InstanceView;
+use nightsplat::splats::device::Upload;
 use nightsplat::splats::model::Model;
 use nightsplat::splats::render::Instance;
 

@@ -1,6 +1,7 @@
 //! What is under a pixel, where it was in the frame before, and cameras without perspective.
 
 use glam::DQuat;
+use nightsplat::splats::device::Upload;
 use nightsplat::splats::render::{Instance, Motion, Pick, PickedSplat};
 
 use super::*;

@@ -3,7 +3,7 @@
 use std::fs::File;
 use std::io::Write;
 
-use nightsplat::train::diagnose::Diagnosis;
+use nightsplat_diagnose::Diagnosis;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
 use super::*;

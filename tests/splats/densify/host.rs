@@ -1,10 +1,12 @@
 //! Gaussians in host memory, and density control of them on the device.
 
+use nightsplat_models::gaussians::width;
+
 use nightsplat::splats::batches::Batches;
 use nightsplat::splats::densify::{
     Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, Round,
 };
-use nightsplat::splats::scene::{DeviceGaussians, GaussianSlice, width};
+use nightsplat::splats::device::{DeviceGaussians, GaussianSlice};
 
 use crate::common::prelude::*;
 

@@ -24,9 +24,9 @@ use glam::{DAffine3, DQuat, DVec3, Mat4, Vec3};
 use half::f16;
 use nightsplat::gpu::testing::{faults, gpu, not_run};
 use nightsplat::gpu::{ImageFormat, ImageState};
+use nightsplat::splats::device::Upload;
 use nightsplat::splats::model::Model;
 use nightsplat::splats::render::{RenderOptions, Renderer};
-use nightsplat::splats::scene::Gaussians;
 use nightsplat_capi::camera::{NspCamera, nsp_camera_from_matrices};
 use nightsplat_capi::device::*;
 use nightsplat_capi::error::panics::panic_in;
@@ -34,6 +34,7 @@ use nightsplat_capi::error::*;
 use nightsplat_capi::{image::*, instance::*, model::*, render::*, renderer::*, train::*};
 use nightsplat_core::camera::CameraModel;
 use nightsplat_core::random::Stream;
+use nightsplat_models::gaussians::Gaussians;
 use nightsplat_photographs::image::linear_from_srgb;
 use nightsplat_photographs::tone::{
     InverseTone, SceneLaw, Tone, ToneParameters, ToneSettings, scene_law,

@@ -1,12 +1,12 @@
 //! What a run tells while it trains: scores, and events for `TensorBoard`.
 
+use nightsplat_models::attributes::{ATTRIBUTES, AttributeSpec};
 use nightsplat_photographs::image::ImageFile as _;
 
 use super::TrainLoop;
 use crate::Result;
 use crate::results::eval::{After, Evaluation, Metric, ScoredImages};
 use crate::results::run::{Event, RunDirectory};
-use crate::splats::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::train::{StepReport, Trainer};
 
 impl TrainLoop<'_> {
