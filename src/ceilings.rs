@@ -4,8 +4,7 @@
 use std::time::{Duration, Instant};
 
 use crate::Result;
-use crate::gpu::CheckReport;
-use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::gpu::{Buffer, CheckReport, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::ceiling;
 
 /// What is measured.

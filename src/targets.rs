@@ -7,7 +7,6 @@
 //! pictures of another program --------------------> target
 //! ```
 
-pub mod external;
 pub mod pseudo_gt;
 pub mod structure;
 

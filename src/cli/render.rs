@@ -12,8 +12,7 @@ use nightsplat_photographs::image::Image;
 use nightsplat_photographs::image::ImageFile as _;
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tree::check_writable;
-use nightsplat_report::colour_map;
-use nightsplat_report::video;
+use nightsplat_report::{colour_map, video};
 
 mod shots;
 

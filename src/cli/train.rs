@@ -19,10 +19,9 @@ use crate::Error;
 use crate::driver;
 use crate::gpu::DeviceChoice;
 use crate::live;
-use crate::results::eval;
 use crate::results::run::{self, Event, IfExists, Requests, RunDirectory, RunSummary, Session};
 use crate::results::run_facts::RunFacts;
-use crate::results::verdict;
+use crate::results::{eval, verdict};
 use crate::train::plan::Plan;
 use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 

@@ -5,13 +5,11 @@
 //! step the geometric mean of the gains over the training views is 1 and the mean of the biases 0, exactly
 //! ([`Exposures::center`]), so that a view of mean exposure in stops shows the model itself.
 
-mod affine;
-pub mod table;
-
 use glam::{UVec2, Vec2};
 use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
 use nightsplat_models::gaussians::COLOR_CHANNELS;
+use nightsplat_photographs::exposures::Affine;
 
 use super::{no_scratch, pixel_count};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -19,7 +17,6 @@ use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use crate::kernels::{expose, expose_backward, exposure_center, exposure_gradient};
 use crate::splats::optimizer::{AdamBuffers, Learnable, Moments};
 use crate::{Error, Result};
-pub use affine::Affine;
 
 settings! {
 "exposure.rates."
@@ -78,7 +75,7 @@ impl Exposures {
     ) -> Result<Self> {
         let mut parameters = vec![];
         for affine in Affine::about_their_mean(start) {
-            parameters.extend(affine.parameters()?);
+            parameters.extend(parameters_of(&affine)?);
         }
         if parameters.is_empty() || whites.len() < start.len() {
             return Err(Error::Usage(
@@ -225,7 +222,7 @@ impl Exposures {
     /// The current exposure of every view.
     pub fn affines(&self) -> Result<Vec<Affine>> {
         let parameters = self.gpu.read(&self.parameters)?;
-        Ok(parameters.chunks_exact(EXPOSURE_WIDTH as usize).map(Affine::of_parameters).collect())
+        Ok(parameters.chunks_exact(EXPOSURE_WIDTH as usize).map(affine_of).collect())
     }
 
     fn chunks(&self, size: UVec2) -> u32 {
@@ -267,24 +264,22 @@ impl Learnable for Exposures {
     }
 }
 
-impl Affine {
-    /// Its learned parameters.
-    fn parameters(&self) -> Result<[f32; EXPOSURE_WIDTH as usize]> {
-        let [gains, biases] = [self.gain.map(f64::ln), self.bias.map(|b| b / BIAS_SCALE)];
-        let mut parameters = [0.0; EXPOSURE_WIDTH as usize];
-        for (to, value) in parameters.iter_mut().zip(gains.into_iter().chain(biases)) {
-            *to = value as f32;
-        }
-        if self.gain.iter().all(|&gain| gain > 0.0) && parameters.iter().all(|p| p.is_finite()) {
-            return Ok(parameters);
-        }
-        Err(Error::Usage(format!(
-            "{self} is not an exposure: gains must be above 0, and all values finite"
-        )))
+/// The learned parameters of an exposure.
+fn parameters_of(affine: &Affine) -> Result<[f32; EXPOSURE_WIDTH as usize]> {
+    let [gains, biases] = [affine.gain.map(f64::ln), affine.bias.map(|b| b / BIAS_SCALE)];
+    let mut parameters = [0.0; EXPOSURE_WIDTH as usize];
+    for (to, value) in parameters.iter_mut().zip(gains.into_iter().chain(biases)) {
+        *to = value as f32;
     }
+    if affine.gain.iter().all(|&gain| gain > 0.0) && parameters.iter().all(|p| p.is_finite()) {
+        return Ok(parameters);
+    }
+    Err(Error::Usage(format!(
+        "{affine} is not an exposure: gains must be above 0, and all values finite"
+    )))
+}
 
-    fn of_parameters(parameters: &[f32]) -> Self {
-        let at = |c: usize| f64::from(parameters[c]);
-        Self { gain: [0, 1, 2].map(|c| at(c).exp()), bias: [3, 4, 5].map(|c| BIAS_SCALE * at(c)) }
-    }
+fn affine_of(parameters: &[f32]) -> Affine {
+    let at = |c: usize| f64::from(parameters[c]);
+    Affine { gain: [0, 1, 2].map(|c| at(c).exp()), bias: [3, 4, 5].map(|c| BIAS_SCALE * at(c)) }
 }

@@ -14,7 +14,6 @@ use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
 
 use crate::gpu::Gpu;
-use crate::loss::exposure::Affine;
 use crate::networks::lpips::Lpips;
 use crate::splats::device::{DeviceGaussians, Upload};
 use crate::splats::lamp::Lamp;
@@ -23,6 +22,7 @@ use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::targets::Targets;
 use crate::train::{Networks, Rendered, TrainConfig};
 use crate::{Error, Result};
+use nightsplat_photographs::exposures::Affine;
 
 mod layers;
 mod lit;

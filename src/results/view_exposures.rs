@@ -7,8 +7,8 @@ use nightsplat_photographs::image::Image;
 use nightsplat_photographs::tone::exposure_knots;
 
 use super::run;
-use crate::loss::exposure::Affine;
 use crate::{Error, Result};
+use nightsplat_photographs::exposures::Affine;
 
 /// The exposures of the training views relative to that of the model.
 pub(crate) enum ViewExposures {

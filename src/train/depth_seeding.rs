@@ -22,11 +22,11 @@ use super::supervision::Supervision;
 use super::views::{TrainView, Views};
 use crate::Result;
 use crate::gpu::Gpu;
-use crate::loss::exposure::Affine;
 use crate::splats::device::Upload;
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
+use nightsplat_photographs::exposures::Affine;
 
 /// The most views that are sampled.
 const VIEWS: usize = 16;

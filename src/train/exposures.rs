@@ -8,10 +8,10 @@ use nightsplat_photographs::image::{Image, exposure_value, linear_from_srgb, srg
 
 use super::config::TrainConfig;
 use super::views::Views;
-use crate::loss::exposure::{Affine, table};
 use crate::targets::Targets;
 use crate::{Error, Result};
 use nightsplat_diagnose::exposures_at_points;
+use nightsplat_photographs::exposures::{Affine, table};
 
 /// The stops of linear light by which photographs are brighter than the mean of the training views, by view: from the
 /// table of the configuration or the dataset, else from EXIF. Empty where no exposure is known, or all are alike.

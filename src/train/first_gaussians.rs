@@ -15,11 +15,11 @@ use super::config::TrainConfig;
 use super::streams;
 use super::views::{ImageKind, TrainView, TrainingPhotograph, Views};
 use crate::gpu::Gpu;
-use crate::loss::exposure::Affine;
 use crate::networks::NetworkVariant;
 use crate::splats::lamp::Lamp;
 use crate::targets::pseudo_gt::PseudoGt;
 use crate::{Error, Result};
+use nightsplat_photographs::exposures::Affine;
 
 impl Views {
     /// The points of the dataset, followed by random ones if there are few or none.

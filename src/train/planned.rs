@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use nightsplat_photographs::dataset::{Dataset, LoadOptions};
+use nightsplat_photographs::external_targets::ExternalTargets;
 use toml::Value;
 
 use super::config::TrainConfig;
@@ -11,7 +12,6 @@ use super::plan::{Plan, PlannedPart};
 use super::preset::Preset;
 use super::trainer::Trainer;
 use crate::gpu::Gpu;
-use crate::targets::external::ExternalTargets;
 use crate::{Error, Result};
 use nightsplat_diagnose::Diagnosis;
 

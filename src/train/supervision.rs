@@ -16,11 +16,12 @@ use super::terms::{NetworkTerms, Photographs};
 use super::views::{TrainingView, Views};
 use crate::Result;
 use crate::gpu::{Buffer, Recorder};
-use crate::loss::exposure::{Affine, Exposures};
+use crate::loss::exposure::Exposures;
 use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, TermInputs};
 use crate::splats::optimizer::{Adam, Learnable};
 use crate::splats::render::Renderer;
 use crate::targets::Targets;
+use nightsplat_photographs::exposures::Affine;
 
 /// The training views with their targets, and the terms of the loss.
 #[derive(Debug)]

@@ -11,9 +11,9 @@ use super::call::{Call, Scored};
 use super::rendered::Rendered;
 use super::views::{ImageKind, TrainingPhotograph, Views};
 use crate::Result;
-use crate::loss::exposure::Affine;
 use crate::targets::Targets;
 use crate::targets::pseudo_gt::PseudoGt;
+use nightsplat_photographs::exposures::Affine;
 
 /// Views with their targets.
 #[derive(Debug, Default)]

@@ -22,11 +22,11 @@ use super::rendered::Rendered;
 use super::supervision::Supervision;
 use crate::gpu::{CheckReport, Gpu, PassTime, Recorder};
 use crate::loss::Term;
-use crate::loss::exposure::Affine;
 use crate::splats::lamp::Lamp;
 use crate::splats::optimizer::{AdamStep, GaussianStep, LearningRates};
 use crate::splats::render::{Damping, Gradients, Instance, Purpose, RenderOptions, RenderSettings};
 use crate::{Error, Result, splats};
+use nightsplat_photographs::exposures::Affine;
 
 /// The interval of the smoothing floor, which visits every camera; scales change by at most 8 % in between.
 const FLOOR_STEPS: u64 = 16;

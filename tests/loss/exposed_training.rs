@@ -1,10 +1,10 @@
 //! Trainings on photographs of different exposure.
 
 use nightsplat::kernels::exposure::BIAS_SCALE;
-use nightsplat::loss::exposure::{Affine, table};
 use nightsplat::results::run::{self, IfExists};
 use nightsplat::train::Part;
 use nightsplat_photographs::dataset::View;
+use nightsplat_photographs::exposures::{Affine, table};
 use nightsplat_photographs::image::srgb_from_linear;
 
 use crate::common::prelude::*;

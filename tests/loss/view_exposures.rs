@@ -3,8 +3,9 @@
 
 use nightsplat::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use nightsplat::kernels::{expose, expose_backward, exposure_center, exposure_gradient};
-use nightsplat::loss::exposure::{Affine, ExposureRates, Exposures};
+use nightsplat::loss::exposure::{ExposureRates, Exposures};
 use nightsplat::splats::optimizer::{Adam, Learnable};
+use nightsplat_photographs::exposures::Affine;
 
 use crate::common::chain::Chain;
 use crate::common::prelude::*;

@@ -8,10 +8,14 @@
 //! - [`tone`]: curves that brighten a photograph
 //! - [`findings`]: what is odd about the brightness of a set, in sentences
 //! - [`dataset`]: photographs with their cameras and points, from disk
+//! - [`exposures`]: gain and bias of views
+//! - [`external_targets`]: pictures of another program that take the place of a curve
 //! - [`scene_tone`]: from the measurements of a scene's photographs to the curve of each
 
 mod colour_chart;
 pub mod dataset;
+pub mod exposures;
+pub mod external_targets;
 pub mod findings;
 pub mod image;
 pub mod metrics;

@@ -9,7 +9,9 @@ use std::path::{Path, PathBuf};
 use nightsplat_core::output::{create_folder, one_line};
 use nightsplat_photographs::dataset::{Dataset, Split};
 use nightsplat_photographs::findings::findings;
-use nightsplat_photographs::image::{ColourCounts, Image, Mask, Orientation, PictureFile};
+use nightsplat_photographs::image::{
+    ColourCounts, Image, ImageFile as _, Mask, Orientation, PictureFile, decoded_at_once,
+};
 use nightsplat_photographs::metrics::Scores;
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{
@@ -18,6 +20,7 @@ use nightsplat_photographs::tone::{
 };
 use nightsplat_photographs::tree::check_writable;
 use nightsplat_report::Distribution;
+use rayon::prelude::*;
 use serde::Serialize;
 
 use self::page::TonePage;
@@ -291,6 +294,12 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     Ok(output)
 }
 
+/// The most bytes of decoded photographs that are kept from measuring to mapping.
+const MOST_KEPT: usize = 1 << 30;
+
+/// A photograph, and the indices of its unusable pixels.
+type Decoded = (Image, Vec<usize>);
+
 /// A curve with its statistics of the whole dataset, if it has any.
 struct CurveOnSet {
     targets: Targets,
@@ -300,6 +309,8 @@ struct CurveOnSet {
     colours: [ColourCounts; 2],
     /// Those that are not for tests, by file: all where the curve depends on the whole set, else as they are mapped.
     measured: BTreeMap<PathBuf, MeasuredPhotograph>,
+    /// Of the measured ones, those that are kept until they are mapped.
+    decoded: BTreeMap<PathBuf, Decoded>,
 }
 
 impl CurveOnSet {
@@ -311,14 +322,26 @@ impl CurveOnSet {
         (input, inverted): (&Path, bool),
     ) -> Result<Self> {
         let levels = photographs.first().map(|listed| listed.levels).unwrap_or_default();
-        let mut measured = BTreeMap::new();
+        let colours = [ColourCounts::of_levels(levels), ColourCounts::new("reference image")];
+        let (mut measured, mut decoded, mut kept) = (BTreeMap::new(), BTreeMap::new(), 0);
         if settings.scene_statistics || settings.takes_exposure() {
-            for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
-                // Unusable photographs are reported when they are mapped.
-                let unsaid = ColourCounts::of_levels(levels);
-                let Ok((photograph, gaps)) = loaded(listed, inverted, &unsaid) else { continue };
-                let one = MeasuredPhotograph::measure(&without(&photograph, &gaps));
-                measured.insert(listed.input.clone(), one);
+            let training = photographs.iter().filter(|one| one.split != Some(Split::Test));
+            let training: Vec<&InputPhotograph> = training.collect();
+            for listed in training.chunks(at_once(&training)) {
+                let measure = |listed: &&InputPhotograph| {
+                    // Unusable photographs are reported when they are mapped.
+                    let (photograph, gaps) = loaded(listed, inverted, &colours[0]).ok()?;
+                    let one = MeasuredPhotograph::measure(&without(&photograph, &gaps));
+                    Some((listed.input.clone(), one, (photograph, gaps)))
+                };
+                let all: Vec<_> = listed.par_iter().filter_map(measure).collect();
+                for (path, one, photograph) in all {
+                    measured.insert(path.clone(), one);
+                    kept += size_of_val(photograph.0.data.as_slice());
+                    if kept <= MOST_KEPT {
+                        decoded.insert(path, photograph);
+                    }
+                }
             }
             if measured.is_empty() && settings.scene_statistics {
                 let problem =
@@ -332,12 +355,18 @@ impl CurveOnSet {
             None if photographs.is_empty() => SceneTone::new(&settings),
             None => return Err(all_black(input)),
         };
-        Ok(Self {
-            targets: Targets::in_scene(gpu, scene)?,
-            inverted,
-            colours: [ColourCounts::of_levels(levels), ColourCounts::new("reference image")],
-            measured,
-        })
+        Ok(Self { targets: Targets::in_scene(gpu, scene)?, inverted, colours, measured, decoded })
+    }
+
+    /// The photograph, read unless it was kept.
+    fn photograph(&mut self, listed: &InputPhotograph) -> Result<Decoded> {
+        if let Some(kept) = self.decoded.remove(&listed.input) {
+            return Ok(kept);
+        }
+        // Colours are counted once.
+        let is_counted = self.measured.contains_key(&listed.input);
+        let unsaid = is_counted.then(|| ColourCounts::of_levels(listed.levels));
+        loaded(listed, self.inverted, unsaid.as_ref().unwrap_or(&self.colours[0]))
     }
 
     /// Statistics of a photograph, its mapped image and the gain.
@@ -360,12 +389,16 @@ impl CurveOnSet {
     }
 }
 
-/// A photograph and the indices of its unusable pixels.
-fn loaded(
-    listed: &InputPhotograph,
-    inverted: bool,
-    colours: &ColourCounts,
-) -> Result<(Image, Vec<usize>)> {
+/// How many photographs are decoded at once.
+fn at_once(photographs: &[&InputPhotograph]) -> usize {
+    let pixels = |listed: &&InputPhotograph| {
+        let (width, height) = listed.decoded_size(Image::size_of(&listed.input).ok()?);
+        Some(u64::from(width) * u64::from(height))
+    };
+    decoded_at_once(photographs.iter().filter_map(pixels).max().unwrap_or_default())
+}
+
+fn loaded(listed: &InputPhotograph, inverted: bool, colours: &ColourCounts) -> Result<Decoded> {
     let (photograph, gaps) = listed.load(inverted, colours)?;
     let (photograph, gaps) = listed.turned(photograph, gaps);
     if gaps.len() == photograph.pixel_count() {
@@ -385,7 +418,7 @@ struct Mapped {
 }
 
 fn mapped(set: &mut CurveOnSet, listed: &InputPhotograph) -> Result<Mapped> {
-    let (photograph, gaps) = loaded(listed, set.inverted, &set.colours[0])?;
+    let (photograph, gaps) = set.photograph(listed)?;
     let load = |path: &PathBuf| {
         let file = PictureFile::open(path)?.reduced(|size| listed.decoded_size(size));
         let (image, _) = file.decode_counted(&set.colours[1])?;

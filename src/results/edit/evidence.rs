@@ -24,10 +24,10 @@ use nightsplat_photographs::image::Image;
 
 use super::capture::ModelPhotographs;
 use crate::Result;
-use crate::loss::exposure::Affine;
 use crate::splats::device::{DeviceGaussians, Upload};
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer, ViewGradients};
+use nightsplat_photographs::exposures::Affine;
 
 /// Images of signs per view.
 const PROBES: usize = 2;

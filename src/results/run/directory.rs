@@ -40,10 +40,10 @@ use super::ledger;
 pub use super::progress::RunProgress;
 use crate::gpu::Gpu;
 use crate::loss::Term;
-use crate::loss::exposure::{Affine, table};
 use crate::train::plan::Plan;
 use crate::train::{Networks, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
+use nightsplat_photographs::exposures::{Affine, table};
 
 /// A run directory and its growing log.
 #[derive(Debug)]

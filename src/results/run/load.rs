@@ -15,10 +15,10 @@ use super::directory::view_lines;
 use super::files::{EXPOSURES, LAMP, NETWORKS, PLAN, TARGET_EXPOSURE, VIEWS};
 use super::generations;
 use crate::gpu::Gpu;
-use crate::loss::exposure::{Affine, table};
 use crate::splats::lamp::Lamp;
 use crate::train::{ModelConfig, Networks, TrainConfig};
 use crate::{Error, Result};
+use nightsplat_photographs::exposures::{Affine, table};
 
 /// Whether a directory contains a finished run.
 pub fn is_finished(run: &Path) -> bool {

@@ -10,8 +10,7 @@ use nightsplat_report::{Chart, Column, Comparison, Mark, NumberTable, Picture, R
 
 use super::point::{ADAPTIVE, OFFSET};
 use super::rows::{SweepResults, SweepRow};
-use super::run::FailedPoint;
-use super::run::SweepRun;
+use super::run::{FailedPoint, SweepRun};
 use super::table::{ColumnStatistic, CsvColumn, Quantity};
 use crate::Result;
 use crate::gpu::Gpu;

@@ -3,10 +3,10 @@
 use std::ops::Range;
 
 use nightsplat::bench::scene;
-use nightsplat::loss::exposure::{Affine, table};
 use nightsplat::{Error, Result};
 use nightsplat_core::camera::TrainingFrame;
 use nightsplat_photographs::dataset::{Point, View};
+use nightsplat_photographs::exposures::{Affine, table};
 
 use crate::common::prelude::*;
 

@@ -78,8 +78,8 @@ mod tests {
         for size in [(8064, 6048), (9504, 6336), (8192, 8192)] {
             assert_eq!(reduced_size(size, (1, 1)), size);
         }
-        let (whole, half, quarter) = ((11_600, 8700), (5800, 4350), (2900, 2175));
-        for (wanted, reduced) in [(1600, quarter), (3867, half), (5801, whole), (11_600, whole)] {
+        let (whole, half, fifth) = ((11_600, 8700), (5800, 4350), (2320, 1740));
+        for (wanted, reduced) in [(1600, fifth), (3867, half), (5801, whole), (11_600, whole)] {
             let found = reduced_size(whole, (wanted, wanted * 3 / 4));
             assert_eq!(found, reduced);
         }

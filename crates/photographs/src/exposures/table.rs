@@ -11,12 +11,11 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use nightsplat_core::output::write_whole;
-use nightsplat_core::{csv, input};
-use nightsplat_photographs::image::files::stem;
-use nightsplat_photographs::image::{MIDDLE_GREY, linear_from_srgb, srgb_from_linear};
+use nightsplat_core::{Error, Result, csv, input};
 
 use super::Affine;
-use crate::{Error, Result};
+use crate::image::files::stem;
+use crate::image::{MIDDLE_GREY, linear_from_srgb, srgb_from_linear};
 
 /// The columns in the order in which they are written.
 const COLUMNS: [&str; 8] =

@@ -1,10 +1,12 @@
-//! Gain and bias of each channel.
+//! Exposures of views: gain and bias of each channel.
+
+pub mod table;
 
 use std::fmt;
 
-use nightsplat_photographs::image::Image;
+use nightsplat_core::{Error, Result};
 
-use crate::{Error, Result};
+use crate::image::Image;
 
 /// The exposure of a view: encoded values times gain plus bias, per channel.
 #[derive(Clone, Copy, Debug, PartialEq)]

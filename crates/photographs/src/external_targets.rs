@@ -4,10 +4,11 @@
 use std::path::Path;
 
 use nightsplat_core::{Error, Result};
-use nightsplat_photographs::dataset::{Dataset, View};
-use nightsplat_photographs::image::decoded_at_once;
-use nightsplat_photographs::image::files::photographs_in;
 use rayon::prelude::*;
+
+use crate::dataset::{Dataset, View};
+use crate::image::decoded_at_once;
+use crate::image::files::photographs_in;
 
 /// A larger share of clipped pixels is reported as a loss.
 const MOST_CLIPPED: f64 = 0.01;
