@@ -64,7 +64,7 @@ compile() {
     run "$1" "$nightsplat" bench --unchecked --repeats 1 --gaussians 1000 || return
     local train=(train "$work/set" --out "$work/run" --overwrite --plan none --steps 2 --sh-degree 3)
     run "$1" "$nightsplat" "${train[@]}" --model plain --exposure on --set loss.opacity_weight=0.01 || return
-    run "$1" "$nightsplat" "${train[@]}" --model plain --parts lamp || return
+    run "$1" "$nightsplat" "${train[@]}" --model plain --parts lamp,normals || return
     case $1 in
         navi31 | gfx1201) run "$1" "$nightsplat" "${train[@]}" --model lita --denoiser-precision half ;;
     esac
@@ -88,11 +88,12 @@ compile_elsewhere() {
         "$work/compile-arm64" > "$lines"
 }
 
-if [ ! -e "$work/set/masks" ]; then
+if [ ! -e "$work/set/normals" ]; then
     rm -rf "$work/set"
     "$nightsplat" synth "$work/set" --views 3 --width 64 --height 48 > /dev/null
-    # Any image is a mask.
+    # Any image is a mask, and a map of normals.
     cp -r "$work/set/high" "$work/set/masks"
+    cp -r "$work/set/high" "$work/set/normals"
 fi
 status=0
 for architecture in "$@"; do
