@@ -1,5 +1,5 @@
-//! Kernels that were compiled before: a packaged crate has them in `precompiled/`, where `scripts/precompile.sh` wrote
-//! them. A host that builds such a crate compiles no C++.
+//! Kernels that were compiled before: a packaged crate has them in `precompiled/`, where `scripts/package-crate.sh`
+//! wrote them. A host that builds such a crate compiles no C++.
 
 use std::fs;
 use std::path::{Path, PathBuf};
