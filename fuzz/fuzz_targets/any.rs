@@ -8,6 +8,7 @@ mod parsers;
 
 fuzz_target!(|bytes: &[u8]| {
     let name = env!("CARGO_BIN_NAME");
-    let (_, parse) = parsers::PARSERS.iter().find(|(parser, _)| *parser == name).expect("a parser of this name");
+    let (_, parse) =
+        parsers::PARSERS.iter().find(|(parser, _)| *parser == name).expect("a parser of this name");
     parse(bytes);
 });

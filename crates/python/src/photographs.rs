@@ -4,10 +4,10 @@ use std::path::PathBuf;
 
 use nightsplat::synthetic::{self, SyntheticOptions};
 use nightsplat::targets::pseudo_gt::PseudoGt;
-use nightsplat_diagnose::Diagnosis;
-use nightsplat::train::plan::Plan;
 use nightsplat::train::diagnosed;
+use nightsplat::train::plan::Plan;
 use nightsplat::{Error, Image, ImageFile, Tone, TrainConfig};
+use nightsplat_diagnose::Diagnosis;
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::MeasuredPhotograph;
 use pyo3::prelude::*;

@@ -75,7 +75,9 @@ impl Swapchain {
                 .composite_alpha(vk::CompositeAlphaFlagsKHR::OPAQUE)
                 .present_mode(vk::PresentModeKHR::FIFO)
                 .clipped(true)
-                .old_swapchain(former.as_ref().map_or_else(Default::default, |former_chain| former_chain.raw));
+                .old_swapchain(
+                    former.as_ref().map_or_else(Default::default, |former_chain| former_chain.raw),
+                );
             let swapchain = swapchains.create_swapchain(&info, None)?;
             if let Some(former) = former {
                 former.destroy(device);
