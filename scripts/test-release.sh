@@ -22,8 +22,10 @@ finish() {
 }
 trap finish EXIT
 
-mirrors() { sed -nE 's/^(deb (\[[^]]*\] )?|URIs: )(https?:[^ ]+).*/\3/p' /etc/apt/sources.list{,.d/*} 2> /dev/null; }
-mirror=${NIGHTSPLAT_MIRROR:-$(mirrors | head -1)}
+# Most systems have one kind of these files; apt reads no others.
+sources() { cat /etc/apt/sources.list /etc/apt/sources.list.d/*.{list,sources} 2> /dev/null || true; }
+mirrors=$(sources | sed -nE 's/^(deb (\[[^]]*\] )?|URIs: )(https?:[^ ]+).*/\3/p')
+mirror=${NIGHTSPLAT_MIRROR:-${mirrors%%$'\n'*}}
 empty=${KEEP:-$scratch/empty}
 # What any of the parts needs from the system: the loader and a device, and what builds a host in C.
 packages=libvulkan1,mesa-vulkan-drivers,libgcc-s1,gcc,libc6-dev,libvulkan-dev,pkg-config,cmake,make,python3,python3-venv

@@ -86,32 +86,44 @@ pub(super) fn implausible(lens: &Lens) -> Option<String> {
     })
 }
 
-/// Names photographs whose cameras rest on few points, of photographs with how many points they see; `None` without
-/// any. In dark photographs, a third of what half of the others see is what chance matches reach: such cameras are
-/// often of another pose altogether.
-pub(super) fn unsupported(seen: &[(String, usize)]) -> Option<String> {
-    /// The share of the median, and a number of points that holds any camera.
-    const SHARE: f64 = 1.0 / 3.0;
-    const ENOUGH: usize = 60;
+/// Photographs whose cameras rest on few points.
+pub(super) struct WeakCameras {
+    pub(super) names: Vec<String>,
+    /// What is said of them.
+    pub(super) remark: String,
+}
+
+impl WeakCameras {
+    /// The weak ones of photographs with how many points each sees. In dark photographs, a third of what half of the
+    /// others see is what chance matches reach: such cameras are often of another pose altogether.
+    pub(super) fn find(seen: &[(String, usize)]) -> Option<Self> {
+        /// The share of the median, and a number of points that holds any camera.
+        const SHARE: f64 = 1.0 / 3.0;
+        const ENOUGH: usize = 60;
+        let mut counts: Vec<usize> = seen.iter().map(|(_, count)| *count).collect();
+        counts.sort_unstable();
+        let median = *counts.get(counts.len() / 2)?;
+        let is_weak = |count: usize| count < ENOUGH && (count as f64) < SHARE * median as f64;
+        let weak = || seen.iter().filter(|(_, count)| is_weak(*count));
+        let names: Vec<String> = weak().map(|(name, _)| name.clone()).collect();
+        let with_counts = weak().map(|(name, count)| format!("{name} ({count})"));
+        let remark = format!(
+            "few points hold these cameras, which may be wrong and are left out: {}; half of all photographs see \
+             {median}. Take more photographs close to them",
+            first_of(with_counts)
+        );
+        (!names.is_empty()).then_some(Self { names, remark })
+    }
+}
+
+/// The first of some names, and how many more there are.
+pub(super) fn first_of(mut names: impl Iterator<Item = String>) -> String {
     const NAMED: usize = 5;
-    let mut counts: Vec<usize> = seen.iter().map(|(_, count)| *count).collect();
-    counts.sort_unstable();
-    let median = *counts.get(counts.len() / 2)?;
-    let is_weak = |count: usize| count < ENOUGH && (count as f64) < SHARE * median as f64;
-    let weak: Vec<String> = seen
-        .iter()
-        .filter(|(_, count)| is_weak(*count))
-        .map(|(name, count)| format!("{name} ({count})"))
-        .collect();
-    let (first, more) =
-        (weak[..weak.len().min(NAMED)].join(", "), weak.len().saturating_sub(NAMED));
-    let named = if more > 0 { format!("{first} and {more} more") } else { first };
-    (!weak.is_empty()).then(|| {
-        format!(
-            "few points hold these cameras, which may be wrong: {named}; half of all photographs see {median}. Look at \
-             them with `nightsplat view`, and leave wrong ones out with `train --exclude NAME`"
-        )
-    })
+    let first: Vec<String> = names.by_ref().take(NAMED).collect();
+    match names.count() {
+        0 => first.join(", "),
+        more => format!("{} and {more} more", first.join(", ")),
+    }
 }
 
 #[cfg(test)]
@@ -120,17 +132,16 @@ mod tests {
     use nightsplat_core::camera::Distortion;
 
     #[test]
-    fn cameras_that_rest_on_few_points_are_named() {
+    fn cameras_that_rest_on_few_points_are_found() {
         let seen = |counts: &[usize]| -> Vec<(String, usize)> {
             counts.iter().enumerate().map(|(i, &count)| (format!("{i}.png"), count)).collect()
         };
-        let warning = unsupported(&seen(&[33, 75, 83, 112, 130, 193])).unwrap();
-        assert!(
-            warning.contains(": 0.png (33); half") && warning.contains("see 112."),
-            "{warning}"
-        );
+        let weak = WeakCameras::find(&seen(&[33, 75, 83, 112, 130, 193])).unwrap();
+        let remark = weak.remark;
+        assert!(remark.contains(": 0.png (33); half") && remark.contains("see 112."), "{remark}");
+        assert_eq!(weak.names, ["0.png"]);
         for counts in [&[75, 83, 112, 130][..], &[20, 25, 30, 35], &[61, 300, 400, 500], &[]] {
-            assert_eq!(unsupported(&seen(counts)), None, "{counts:?}");
+            assert!(WeakCameras::find(&seen(counts)).is_none(), "{counts:?}");
         }
     }
 

@@ -16,7 +16,7 @@ mod tone_mapped;
 mod tool;
 mod unfinished;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::camera::Lens;
@@ -28,6 +28,7 @@ use nightsplat_photographs::image::files::{photographs_in, stem, unread_in};
 use nightsplat_photographs::tree;
 use nightsplat_photographs::tree::check_writable;
 
+use self::cameras::WeakCameras;
 pub use self::cameras::describe;
 use self::pictures::{BRIGHT, PosePhotographs, bright_name, is_dark};
 use self::reconstruction::Reconstruction;
@@ -220,11 +221,7 @@ fn posed(
     }
     reconstruction.plan().into_iter().for_each(|plan| report(PoseProgress::Line(plan)));
     let models = reconstruction.models(&pictures, report)?;
-    let largest = Dataset::largest_model(&models, is_dark)?;
-    let has_enough = |(_, names): &(PathBuf, Vec<String>)| {
-        names.len() >= MIN_CAMERAS && names.iter().any(|name| is_dark(name))
-    };
-    let (model, names) = largest.filter(has_enough).ok_or_else(|| {
+    let found = best_model(&models)?.ok_or_else(|| {
         let problem = format!(
             "COLMAP found no cameras for these {all} photographs: too little overlap or texture; take more \
              photographs, closer together, or expose longer ({} has its output)",
@@ -232,15 +229,15 @@ fn posed(
         );
         Error::input(&options.photos, problem)
     })?;
+    let Found { model, dark, bright, weak } = found;
     let lenses = possible_lenses(&model, &options.photos)?;
-    let unsupported = cameras::unsupported(&Dataset::points_seen(&model)?);
-    let bright: Vec<String> = names.iter().filter_map(|name| bright_name(name)).collect();
-    let dark: Vec<String> = names.into_iter().filter(|name| is_dark(name)).collect();
     out.add_photographs("", &pictures.dark, &dark)?;
     out.add_masks(&folder, is_clip)?;
     out.add_masks_in_place("", &pictures, &pictures.dark, &dark)?;
-    let own_name = |name: &str| is_dark(name).then(|| name.to_owned());
-    out.add_model("", &model, options.with.as_ref().map(|_| own_name))?;
+    let kept: HashSet<&str> = dark.iter().map(String::as_str).collect();
+    let own_name = |name: &str| kept.contains(name).then(|| name.to_owned());
+    let is_part = options.with.is_some() || weak.is_some();
+    out.add_model("", &model, is_part.then_some(own_name))?;
     if !bright.is_empty() {
         out.add_photographs(BRIGHT, &pictures.bright, &bright)?;
         out.add_masks_in_place(BRIGHT, &pictures, &pictures.bright, &bright)?;
@@ -250,10 +247,33 @@ fn posed(
     let placed = dark.len();
     let target = options.out.display();
     report(PoseProgress::Line(&format!("{placed} of {all} photographs have a camera -> {target}")));
-    warn_of(&lenses, &pictures.dark, &dark);
-    unsupported.iter().for_each(|warning| tracing::warn!("{warning}"));
+    warn_of(&lenses, &pictures.dark, &dark, weak.as_ref());
     let bright = options.with.as_ref().map(|_| [bright.len(), pictures.bright.len()]);
     Ok(Posed { photographs: all, placed, bright, lenses })
+}
+
+/// The model with most of the dark photographs, and the photographs whose cameras are used.
+struct Found {
+    model: PathBuf,
+    dark: Vec<String>,
+    /// Names below their folder.
+    bright: Vec<String>,
+    weak: Option<WeakCameras>,
+}
+
+/// The best of the models; `None` if none has enough cameras that can be used.
+fn best_model(models: &Path) -> Result<Option<Found>> {
+    let Some((model, names)) = Dataset::largest_model(models, is_dark)? else { return Ok(None) };
+    let mut seen = Dataset::points_seen(&model)?;
+    // Bright photographs see more, whatever the scene.
+    seen.retain(|(name, _)| is_dark(name));
+    let weak = WeakCameras::find(&seen);
+    let is_weak = |name: &String| weak.as_ref().is_some_and(|weak| weak.names.contains(name));
+    let is_used = |name: &String| is_dark(name) && !is_weak(name);
+    let bright: Vec<String> = names.iter().filter_map(|name| bright_name(name)).collect();
+    let dark: Vec<String> = names.into_iter().filter(is_used).collect();
+    let has_enough = dark.len() + bright.len() >= MIN_CAMERAS && !dark.is_empty();
+    Ok(has_enough.then_some(Found { model, dark, bright, weak }))
 }
 
 /// The lenses of a model.
@@ -314,9 +334,14 @@ fn brighten(
     Ok(())
 }
 
-/// Warns of implausible lenses, and of photographs without a camera, of which it names the first.
-fn warn_of(lenses: &[Lens], photographs: &[PathBuf], placed: &[String]) {
-    const NAMED: usize = 5;
+/// Warns of implausible lenses, of cameras that are left out, and of photographs without a camera, of which it names
+/// the first.
+fn warn_of(
+    lenses: &[Lens],
+    photographs: &[PathBuf],
+    placed: &[String],
+    weak: Option<&WeakCameras>,
+) {
     for lens in lenses {
         if let Some(problem) = cameras::implausible(lens) {
             tracing::warn!(
@@ -327,12 +352,14 @@ fn warn_of(lenses: &[Lens], photographs: &[PathBuf], placed: &[String]) {
         }
     }
     let names = photographs.iter().filter_map(|path| path.file_name()?.to_str());
-    let is_placed = |name: &&str| placed.iter().any(|file| stem(file) == stem(name));
-    let without: Vec<&str> = names.filter(|name| !is_placed(name)).collect();
+    let weak_names = weak.map_or(&[][..], |weak| &weak.names);
+    let is_placed =
+        |name: &&str| placed.iter().chain(weak_names).any(|file| stem(file) == stem(name));
+    let without: Vec<String> = names.filter(|name| !is_placed(name)).map(str::to_owned).collect();
+    weak.iter().for_each(|weak| tracing::warn!("{}", weak.remark));
     if !without.is_empty() {
-        let (count, first) = (without.len(), without[..without.len().min(NAMED)].join(", "));
-        let more = if count > NAMED { ", ..." } else { "" };
-        tracing::warn!("{count} photographs have no camera and are left out: {first}{more}");
+        let (count, named) = (without.len(), cameras::first_of(without.into_iter()));
+        tracing::warn!("{count} photographs have no camera and are left out: {named}");
     }
     if 2 * placed.len() < photographs.len() {
         tracing::warn!(

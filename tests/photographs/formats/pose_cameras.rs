@@ -101,6 +101,25 @@ fn an_implausible_calibration_is_reported() {
 }
 
 #[test]
+fn a_camera_that_few_points_hold_is_left_out_and_said() {
+    let root = &Folder::empty();
+    let (photos, out) = (photographed(root), root.join("scene"));
+    let mut model = model(9);
+    for (index, (_, _, seen_by)) in model.points.iter_mut().enumerate() {
+        let first = if index < 6 { 7 } else { 8 };
+        *seen_by = (first..16).collect();
+    }
+    model.write_binary(&root.join("models/0"));
+    let (stdout, stderr) = run(&line(&photos, &out, &stub(root, &models(root)), ""), 0);
+    assert!(stdout.contains("8 of 9 photographs with their cameras"), "{stdout}");
+    let left_out = "left out: v00.png (6); half of all photographs see 20";
+    assert!(stderr.contains(left_out) && !stderr.contains("have no camera"), "{stderr}");
+    let dataset = load(&out);
+    let names: BTreeSet<&str> = dataset.views.iter().map(|view| view.name.as_str()).collect();
+    assert!(names.len() == 8 && !names.contains("v00"), "{names:?}");
+}
+
+#[test]
 fn what_is_burnt_in_has_no_features_and_is_masked_in_the_dataset() {
     let root = &Folder::empty();
     let (photos, out, seen) = (photographed(root), root.join("scene"), root.join("seen"));
