@@ -42,7 +42,7 @@ if cargo tree --offline --locked --no-default-features --edges normal,build --pr
     exit 1
 fi
 
-# A third of the build is information for debuggers.
+# Debug information takes a third of the build.
 export CARGO_PROFILE_DEV_DEBUG=0
 TIMEFORMAT="packed, and built without C++ in %U s of processor time and %S s of the system's"
 time cargo package --quiet --workspace --locked --offline --allow-dirty --no-default-features

@@ -22,7 +22,7 @@ finish() {
 }
 trap finish EXIT
 
-# Most systems have one kind of these files; apt reads no others.
+# A system has the one file or the folder, and apt reads these names alone.
 sources() { cat /etc/apt/sources.list /etc/apt/sources.list.d/*.{list,sources} 2> /dev/null || true; }
 mirrors=$(sources | sed -nE 's/^(deb (\[[^]]*\] )?|URIs: )(https?:[^ ]+).*/\3/p')
 mirror=${NIGHTSPLAT_MIRROR:-${mirrors%%$'\n'*}}

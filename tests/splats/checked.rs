@@ -26,7 +26,7 @@ fn dataset(config: &TrainConfig) -> Dataset {
     Dataset::load(folder.path(), &config.load_options()).unwrap()
 }
 
-/// A quarter of the points: references take most of the time. All of them make more than one block to sort.
+/// A quarter of the points, as references take most of the time. The plain steps keep all: more than a block to sort.
 fn with_few_points(dataset: Dataset) -> Dataset {
     Dataset { points: dataset.points.into_iter().step_by(4).collect(), ..dataset }
 }
@@ -69,10 +69,10 @@ fn assert_steps_agree(name: &str, config: &TrainConfig) -> BTreeSet<String> {
 }
 
 fn assert_steps_agree_on(gpu: &Gpu, name: &str, config: &TrainConfig) -> BTreeSet<String> {
-    assert_steps_of_agree(with_few_points(dataset(config)), gpu, name, config)
+    assert_steps_agree_for(with_few_points(dataset(config)), gpu, name, config)
 }
 
-fn assert_steps_of_agree(
+fn assert_steps_agree_for(
     dataset: Dataset,
     gpu: &Gpu,
     name: &str,
@@ -92,7 +92,7 @@ fn assert_steps_of_agree(
 #[test]
 fn every_pass_of_a_step_agrees_with_its_reference_for_every_part_of_the_model() {
     let plain = config(&[]);
-    let plain = assert_steps_of_agree(dataset(&plain), &as_a_cpu(), "plain", &plain);
+    let plain = assert_steps_agree_for(dataset(&plain), &as_a_cpu(), "plain", &plain);
     for kernel in ["project", "sort_downsweep", "blend_backward", "ssim", "densify_scatter"] {
         assert!(plain.contains(kernel), "{kernel} is not in {plain:?}");
     }
@@ -120,7 +120,7 @@ fn every_pass_of_a_step_agrees_with_its_reference_for_every_part_of_the_model() 
 fn every_pass_of_a_step_of_a_gpu_agrees_with_its_reference() {
     let gpu = gpu_with(|properties| properties.is_cpu = false);
     let plain = config(&[]);
-    let plain = assert_steps_of_agree(dataset(&plain), &gpu, "plain", &plain);
+    let plain = assert_steps_agree_for(dataset(&plain), &gpu, "plain", &plain);
     for kernel in ["ssim_forward", "ssim_backward", "adam_gaussian"] {
         assert!(plain.contains(kernel), "{kernel} is not in {plain:?}");
     }

@@ -89,8 +89,8 @@ pub(super) fn implausible(lens: &Lens) -> Option<String> {
 /// Photographs whose cameras rest on few points.
 pub(super) struct WeakCameras {
     pub(super) names: Vec<String>,
-    /// What is said of them.
-    pub(super) remark: String,
+    /// One line that names them, with the remedy.
+    pub(super) warning: String,
 }
 
 impl WeakCameras {
@@ -107,12 +107,12 @@ impl WeakCameras {
         let weak = || seen.iter().filter(|(_, count)| is_weak(*count));
         let names: Vec<String> = weak().map(|(name, _)| name.clone()).collect();
         let with_counts = weak().map(|(name, count)| format!("{name} ({count})"));
-        let remark = format!(
+        let warning = format!(
             "few points hold these cameras, which may be wrong and are left out: {}; half of all photographs see \
              {median}. Take more photographs close to them",
             first_of(with_counts)
         );
-        (!names.is_empty()).then_some(Self { names, remark })
+        (!names.is_empty()).then_some(Self { names, warning })
     }
 }
 
@@ -137,8 +137,8 @@ mod tests {
             counts.iter().enumerate().map(|(i, &count)| (format!("{i}.png"), count)).collect()
         };
         let weak = WeakCameras::find(&seen(&[33, 75, 83, 112, 130, 193])).unwrap();
-        let remark = weak.remark;
-        assert!(remark.contains(": 0.png (33); half") && remark.contains("see 112."), "{remark}");
+        let line = weak.warning;
+        assert!(line.contains(": 0.png (33); half") && line.contains("see 112."), "{line}");
         assert_eq!(weak.names, ["0.png"]);
         for counts in [&[75, 83, 112, 130][..], &[20, 25, 30, 35], &[61, 300, 400, 500], &[]] {
             assert!(WeakCameras::find(&seen(counts)).is_none(), "{counts:?}");

@@ -256,7 +256,7 @@ fn posed(
 struct Found {
     model: PathBuf,
     dark: Vec<String>,
-    /// Names below their folder.
+    /// Names relative to the folder of the bright photographs.
     bright: Vec<String>,
     weak: Option<WeakCameras>,
 }
@@ -265,7 +265,7 @@ struct Found {
 fn best_model(models: &Path) -> Result<Option<Found>> {
     let Some((model, names)) = Dataset::largest_model(models, is_dark)? else { return Ok(None) };
     let mut seen = Dataset::points_seen(&model)?;
-    // Bright photographs see more, whatever the scene.
+    // Bright photographs see more points than dark ones do, which would make all of these weak.
     seen.retain(|(name, _)| is_dark(name));
     let weak = WeakCameras::find(&seen);
     let is_weak = |name: &String| weak.as_ref().is_some_and(|weak| weak.names.contains(name));
@@ -356,7 +356,7 @@ fn warn_of(
     let is_placed =
         |name: &&str| placed.iter().chain(weak_names).any(|file| stem(file) == stem(name));
     let without: Vec<String> = names.filter(|name| !is_placed(name)).map(str::to_owned).collect();
-    weak.iter().for_each(|weak| tracing::warn!("{}", weak.remark));
+    weak.iter().for_each(|weak| tracing::warn!("{}", weak.warning));
     if !without.is_empty() {
         let (count, named) = (without.len(), cameras::first_of(without.into_iter()));
         tracing::warn!("{count} photographs have no camera and are left out: {named}");
