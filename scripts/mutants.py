@@ -194,13 +194,15 @@ def viable(mutants):
 
 
 def built(tests):
-    """The test programs, by name."""
+    """The test programs, by package and name: those of the crate with mutants too."""
     names = [argument for test in tests for argument in ("--test", test)]
-    run, said = messages("test", "--no-run", "--lib", *names)
+    packages = ["--package", "nightsplat", "--package", "nightsplat-photographs"]
+    run, said = messages("test", "--no-run", "--lib", *packages, *names)
     if run.returncode != 0:
         sys.exit(run.stderr[-4000:])
     programs = [message for message in said if message.get("executable") and message["profile"]["test"]]
-    return {message["target"]["name"]: message["executable"] for message in programs}
+    package = lambda message: Path(message["manifest_path"]).parent.name
+    return {f"{package(message)}/{message['target']['name']}": message["executable"] for message in programs}
 
 
 def run_tests(program, names, seconds, **variables):

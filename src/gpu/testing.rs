@@ -1,43 +1,19 @@
 //! The validated device that all tests of a process share, and injected faults.
 
 use std::cell::Cell;
-use std::fmt::Display;
-use std::io::Write;
-use std::panic::Location;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, OnceLock};
 
 use ash::vk;
+pub use nightsplat_core::testing::not_run;
 
 pub use super::faults::Faults;
 use super::{DeviceChoice, Gpu, GpuShared, Interface, Properties};
 
 static GPU: OnceLock<Gpu> = OnceLock::new();
 
-/// The variable with what tests must not go without, separated by commas: lavapipe, validation, colmap, ffmpeg, ...
-const REQUIRE_VARIABLE: &str = "NIGHTSPLAT_REQUIRE";
-
 /// If set, devices run the passes and layouts that a GPU has, on a CPU too: what differs is found before there is one.
 const AS_A_GPU_VARIABLE: &str = "NIGHTSPLAT_AS_A_GPU";
-
-/// Prints that a test, or the rest of it, is not run for lack of `need`, and why.
-///
-/// The harness captures the output of `println!` and `eprintln!` in a passing test, but not that of the handle of
-/// standard error: this line is shown by every `cargo test`.
-///
-/// # Panics
-/// `NIGHTSPLAT_REQUIRE` names `need`.
-#[track_caller]
-#[allow(clippy::explicit_write, reason = "`eprintln!` is what the harness swallows")]
-pub fn not_run(need: &str, why: impl Display) {
-    let (thread, location) = (std::thread::current(), Location::caller());
-    let test = thread.name().unwrap_or("a test");
-    // A closed standard error is no reason to fail.
-    let _ = writeln!(std::io::stderr(), "not run: {test} ({location}): {need}: {why}");
-    let required = std::env::var(REQUIRE_VARIABLE).unwrap_or_default();
-    let is_required = required.split(',').any(|required| required.trim() == need);
-    assert!(!is_required, "{REQUIRE_VARIABLE} names {need}");
-}
 
 /// The device that tests share, with validation and synchronization validation: any message fails the process at its
 /// exit, with the name of the test. `NIGHTSPLAT_DEVICE` selects another device than the default.

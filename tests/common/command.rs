@@ -1,11 +1,12 @@
 //! The built binary as a shell runs it, and folders for its files.
 
 use std::fs;
-use std::ops::Deref;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Output};
 
 use serde_json::Value;
+
+pub(crate) use super::{Folder, says};
 
 /// `nightsplat` with arguments as a shell splits them; paths must not contain spaces. Any validation message fails it.
 pub(crate) fn command(arguments: &str) -> Command {
@@ -56,52 +57,11 @@ pub(crate) fn refused_with(
     }
 }
 
-/// The text must contain all of these parts.
-#[track_caller]
-pub(crate) fn says(text: &str, parts: &[&str]) {
-    for part in parts {
-        assert!(text.contains(part), "no `{part}` in: {text}");
-    }
-}
-
 pub(crate) fn json(text: impl AsRef<[u8]>) -> Value {
     serde_json::from_slice(text.as_ref()).unwrap()
 }
 
-/// A folder for the files of a test, removed with it. In its commands, `@NAME` is the path of NAME in it.
-#[derive(Debug)]
-pub(crate) struct Folder(tempfile::TempDir);
-
-impl Deref for Folder {
-    type Target = Path;
-
-    fn deref(&self) -> &Path {
-        self.0.path()
-    }
-}
-
-impl AsRef<Path> for Folder {
-    fn as_ref(&self) -> &Path {
-        self
-    }
-}
-
 impl Folder {
-    pub(crate) fn empty() -> Self {
-        Self(tempfile::tempdir().unwrap())
-    }
-
-    /// A copy of a folder, beside it.
-    pub(crate) fn copy_of(folder: &Path) -> Self {
-        let copied = Self(tempfile::tempdir_in(folder.parent().unwrap()).unwrap());
-        super::copy(folder, &copied);
-        copied
-    }
-
-    pub(crate) fn path(&self, name: &str) -> PathBuf {
-        self.join(name)
-    }
-
     /// Arguments with the paths that they name.
     pub(crate) fn named(&self, arguments: &str) -> String {
         arguments.replace('@', &format!("{}/", self.display()))
@@ -132,26 +92,8 @@ impl Folder {
         }
     }
 
-    pub(crate) fn read(&self, name: &str) -> Vec<u8> {
-        fs::read(self.join(name)).unwrap()
-    }
-
-    pub(crate) fn text(&self, name: &str) -> String {
-        fs::read_to_string(self.join(name)).unwrap()
-    }
-
     pub(crate) fn json(&self, name: &str) -> Value {
         json(self.read(name))
-    }
-
-    pub(crate) fn write(&self, name: &str, content: impl AsRef<[u8]>) {
-        fs::create_dir_all(self.join(name).parent().unwrap()).unwrap();
-        fs::write(self.join(name), content).unwrap();
-    }
-
-    /// The model of a run.
-    pub(crate) fn model(&self, run: &str) -> Vec<u8> {
-        self.read(&format!("{run}/model.ply"))
     }
 }
 

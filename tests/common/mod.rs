@@ -1,10 +1,11 @@
 //! Shared by the tests: random numbers, comparisons, single kernels, the command, and reports of tests that are not
 //! run.
 
-#![allow(dead_code, unused_macros, reason = "no test binary uses everything")]
+#![allow(dead_code, unused_imports, unused_macros, reason = "no test binary uses everything")]
 
 pub(crate) mod chain;
 pub(crate) mod command;
+mod files;
 pub(crate) mod log;
 pub(crate) mod lpips;
 pub(crate) mod png;
@@ -14,10 +15,8 @@ pub(crate) mod setup;
 pub(crate) mod train;
 pub(crate) mod workspace;
 
-use std::path::{Path, PathBuf};
-
+pub(crate) use files::{Folder, copy, fixture, not_run, says, shared};
 use nightsplat::gpu::Gpu;
-pub(crate) use nightsplat::gpu::testing::not_run;
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat_core::random::Stream;
 
@@ -109,33 +108,4 @@ pub(crate) fn narrow(values: &[f64]) -> Vec<f32> {
 
 pub(crate) fn widen(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&value| value.into()).collect()
-}
-
-/// A file or folder of captures that may be next to the checkout; without it, the rest of the test is not run.
-#[track_caller]
-pub(crate) fn shared(name: &str) -> Option<PathBuf> {
-    let path = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared")).join(name);
-    if path.exists() {
-        return Some(path);
-    }
-    not_run("captures", format_args!("../shared/{name} is absent"));
-    None
-}
-
-/// A file or folder that is committed with the tests.
-pub(crate) fn fixture(name: &str) -> PathBuf {
-    PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures")).join(name)
-}
-
-/// Copies a folder.
-pub(crate) fn copy(from: &Path, to: &Path) {
-    std::fs::create_dir_all(to).unwrap();
-    for entry in std::fs::read_dir(from).unwrap() {
-        let (path, target) = entry.map(|e| (e.path(), to.join(e.file_name()))).unwrap();
-        if path.is_dir() {
-            copy(&path, &target);
-        } else {
-            std::fs::copy(path, target).unwrap();
-        }
-    }
 }

@@ -1,5 +1,4 @@
 //! What most tests use.
-#![allow(unused_imports, reason = "no test binary uses everything")]
 
 pub(crate) use crate::common::setup::Setup;
 pub(crate) use crate::common::train::{advance, small_set};

@@ -192,8 +192,8 @@ fn unsafe_code_is_only_in_the_gpu_layer_and_the_c_interface() {
 #[test]
 fn tests_start_the_command_and_look_for_captures_in_one_place() {
     // There, validation fails the command, and missing captures are reported.
-    for (what, file) in [("CARGO_BIN_", "common/command.rs"), ("/../shar", "common/mod.rs")] {
-        for (path, text) in files("tests", "rs") {
+    for (what, file) in [("CARGO_BIN_", "common/command.rs"), ("../shar", "common/files.rs")] {
+        for (path, text) in [files("tests", "rs"), files("crates", "rs")].concat() {
             let allowed = path.ends_with(file) || path.ends_with("architecture.rs");
             assert!(allowed || !text.contains(what), "{}: see tests/{file}", path.display());
         }

@@ -1,4 +1,4 @@
-//! From files to targets: images, datasets, tone curves, fits and pseudo-GT.
+//! From files to targets by the command and on the device: datasets, poses, tone curves, fits and pseudo-GT.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -6,18 +6,13 @@
 #[path = "../common/mod.rs"]
 mod common;
 
-mod curve_files;
+mod curve_settings;
 mod curves;
-mod exposure;
-mod expressions;
 mod fit;
 mod formats;
 mod hostile_bytes;
-mod lamp;
-mod metrics;
-mod night;
+#[path = "../../crates/fit/tests/fit/pairs.rs"]
+mod pairs;
 mod properties;
 mod pseudo_gt;
-mod street;
-mod synthetic;
-mod tone;
+mod synth;

@@ -15,6 +15,7 @@
 //! - [`camera`]: cameras and lens distortion
 //! - [`image`]: images in memory
 //! - [`curves`]: the formulas of tone curves
+//! - [`testing`]: tests that are not run say why
 //! - [`watch`]: following long work, and stopping it
 
 pub mod camera;
@@ -31,6 +32,7 @@ pub mod ply;
 pub mod random;
 pub mod settings;
 pub mod table;
+pub mod testing;
 pub mod watch;
 
 pub use error::{Error, Result, Stop};

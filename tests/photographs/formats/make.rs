@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use super::pose::{line, models, photographed, stub};
 use super::synthetic::*;
-use crate::common::command::{command, refused, run, succeed};
+use crate::common::command::{command, refused, run, says, succeed};
 
 /// Options of a training of seconds.
 const TRAINED: &str = "--curve ap3 --model plain --sh-degree 0 --no-open";
@@ -66,13 +66,14 @@ fn a_folder_becomes_a_page_by_one_command_that_goes_on_in_every_stage() {
     kill("-INT", &child.id().to_string());
     let (code, text) = ended(child);
     assert_eq!(code, Some(130), "{text}");
-    for part in [
-        "in all, a coarse estimate: cameras about ",
-        "1 of 3 cameras: ",
-        "stopped at exhaustive_matcher (interrupted), kept; go on with the same command",
-    ] {
-        assert!(text.contains(part), "no `{part}` in: {text}");
-    }
+    says(
+        &text,
+        &[
+            "in all, a coarse estimate: cameras about ",
+            "1 of 3 cameras: ",
+            "stopped at exhaustive_matcher (interrupted), kept; go on with the same command",
+        ],
+    );
     assert!(!text.contains("error"), "{text}");
 
     // Killed there: COLMAP outlives it, and no other process may use its folder.
@@ -120,7 +121,7 @@ fn a_folder_becomes_a_page_by_one_command_that_goes_on_in_every_stage() {
     let (_, text) = run(&line, 1);
     assert!(text.contains("cameras of other photographs or options; begin anew with --overwrite"));
     succeed(&format!("{line} --overwrite --steps 3").replace("--steps 2000", ""));
-    assert_eq!(super::load(&made.join("dataset")).views.len(), 9);
+    assert_eq!(load(&made.join("dataset")).views.len(), 9);
 }
 
 #[test]
@@ -140,7 +141,7 @@ fn a_dataset_has_two_stages_and_what_is_made_stays_apart_from_it() {
     let out = root.join("out");
     let line = format!("make {} --out {} --steps 2 {TRAINED}", set.display(), out.display());
     let text = succeed(&format!("{line} --title Attic"));
-    assert!(text.contains("2 of 2 page: wrote ") && text.contains("next: open "), "{text}");
+    says(&text, &["2 of 2 page: wrote ", "next: open "]);
     assert!(fs::read_to_string(out.join("set.html")).unwrap().contains("<title>Attic</title>"));
     // A run is no dataset.
     let run_folder = out.join("run").display().to_string();

@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 
 use nightsplat_photographs::image::{Image, ImageFile};
 
-use super::load;
 use super::pose::{is_installed, line, photographed, stub};
 use super::synthetic::*;
 use crate::common::command::{refused, run, succeed};
@@ -117,7 +116,7 @@ fn colmap_poses_dark_photographs_through_bright_ones_of_other_views() {
     assert!(dark.views.len() >= 3 && bright.views.len() >= 15, "{} dark", dark.views.len());
     // Distances of every dark camera from the bright ones, whose scale is free.
     let center = |set: &nightsplat_photographs::dataset::Dataset, name: &str| {
-        super::view(set, name).camera.center()
+        view(set, name).camera.center()
     };
     let mut distances = vec![];
     for dark_view in &dark.views {

@@ -10,7 +10,7 @@ use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{InverseTone, MeasuredPhotograph, ToneCurve, ToneSettings};
 use nightsplat_synth::SyntheticOptions;
 
-use super::Folder;
+use super::synthetic::Folder;
 use crate::common::Random;
 use crate::common::command::succeed;
 

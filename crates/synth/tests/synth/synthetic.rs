@@ -1,10 +1,15 @@
 //! The synthetic dataset has its documented layout, loads, and depends only on its options, byte for byte.
 
-use nightsplat_photographs::dataset::{LoadOptions, NormalOptions};
-use nightsplat_synth::{DARKENING, Night};
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
 
-use crate::common::command::{refused, run};
-use crate::common::prelude::*;
+use glam::{DVec2, DVec3, Vec3};
+use nightsplat_core::camera::CameraModel;
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, NormalOptions, Split};
+use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb};
+use nightsplat_synth::{DARKENING, Night, SyntheticOptions};
+use serde_json::Value;
 
 const SMALL: SyntheticOptions = SyntheticOptions {
     views: 10,
@@ -162,18 +167,14 @@ fn the_dark_photograph_is_the_reference_darkened_in_linear_light() {
 /// The floor is z = 0 in the world.
 #[test]
 fn normal_maps_face_the_camera_and_have_the_normal_of_the_floor() {
-    let dir = tempfile::tempdir().unwrap();
-    let set = dir.path().join("set");
-    run(
-        &format!("synth {} --views 10 --width 48 --height 36 --seed 5 --normals", set.display()),
-        0,
-    );
+    let dir = written(&SyntheticOptions { normals: true, ..SMALL });
+    let set = dir.path();
     let (maps, others): (BTreeMap<_, _>, BTreeMap<_, _>) =
-        files(&set).into_iter().partition(|(name, _)| name.starts_with("normals/"));
+        files(set).into_iter().partition(|(name, _)| name.starts_with("normals/"));
     assert_eq!(others, files(written(&SMALL).path()), "the photographs are the same");
     assert_eq!(maps.len(), 8, "{:?}", maps.keys());
     let normals = NormalOptions { load: true, ..NormalOptions::default() };
-    let dataset = Dataset::load(&set, &LoadOptions { normals, ..LoadOptions::default() }).unwrap();
+    let dataset = Dataset::load(set, &LoadOptions { normals, ..LoadOptions::default() }).unwrap();
     assert!(dataset.test_views().all(|view| view.normals.is_none()));
     for view in dataset.train_views() {
         assert_eq!(view.normals.as_ref().unwrap().packed().len(), 48 * 36);
@@ -218,25 +219,12 @@ fn a_folder_that_cannot_be_created_is_named() {
 
 #[test]
 fn every_eighth_view_is_a_test_view() {
-    let dir = written(&small_set(17, [16, 16], 0));
+    let dir = written(&SyntheticOptions { views: 17, width: 16, height: 16, ..SMALL });
     let dataset = Dataset::load(dir.path(), &LoadOptions::default()).unwrap();
     let is_test = |(index, view): (usize, &nightsplat_photographs::dataset::View)| {
         (view.split == Split::Test) == (index % 8 == 0)
     };
     assert!(dataset.views.iter().enumerate().all(is_test));
-}
-
-#[test]
-fn a_folder_that_is_not_empty_is_kept_unless_overwritten_and_a_missing_one_is_created() {
-    let dir = tempfile::tempdir().unwrap();
-    fs::write(dir.path().join("letter.txt"), "mine").unwrap();
-    let synth = |dir: &Path| format!("synth {} --views 3 --width 16 --height 16", dir.display());
-    refused(&synth(dir.path()), 1, &["is not empty", "--overwrite"]);
-    assert_eq!(files(dir.path()).len(), 1);
-    run(&format!("{} --overwrite", synth(dir.path())), 0);
-    assert_eq!(files(dir.path())["letter.txt"], b"mine");
-    run(&synth(&dir.path().join("new")), 0);
-    assert!(dir.path().join("new/transforms_train.json").is_file());
 }
 
 #[test]
@@ -268,27 +256,5 @@ fn a_fisheye_dataset_has_one_lens_in_both_listings_and_matching_points() {
         let off = pixel.distance(DVec2::new(observation[0], observation[1]));
         // Positions have the noise of a reconstruction.
         assert!(off < 0.3, "point {id}: off by {off}");
-    }
-}
-
-#[test]
-fn a_fisheye_set_trains_renders_scores_and_exports() {
-    let dir = tempfile::tempdir().unwrap();
-    let [set, native, undistorted] =
-        ["set", "native", "undistorted"].map(|name| dir.path().join(name).display().to_string());
-    run(&format!("synth {set} --fisheye --views 10 --width 48 --height 36"), 0);
-    let message = run(&format!("train {set} --out {native} --steps 200 --seed 1"), 0).1;
-    assert!(!message.contains("cropped"), "{message}");
-    run(&format!("train {set} --out {undistorted} --steps 1 --undistort"), 0);
-    let scores = run(&format!("eval {native} --json"), 0).0;
-    let scores: Value = serde_json::from_str(&scores).unwrap();
-    let psnr = scores["mean"]["psnr"].as_f64().unwrap_or_else(|| panic!("{scores}"));
-    assert!(psnr > 15.0, "{psnr}");
-    let frames = dir.path().join("frames");
-    run(&format!("render {native} --path interpolate --frames 2 --out {}", frames.display()), 0);
-    for (to, name) in [("ply", "model.ply"), ("html", "page.html")] {
-        let out = dir.path().join(name);
-        run(&format!("export {native} --format {to} --out {}", out.display()), 0);
-        assert!(out.exists());
     }
 }

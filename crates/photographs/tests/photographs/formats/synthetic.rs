@@ -1,13 +1,19 @@
 //! A small capture on a ring of cameras, written in every supported layout.
 
-use std::fs;
+#![allow(dead_code, reason = "the tests of the command use less")]
+
+use std::fs::{self, File};
+use std::io::Write as _;
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
+use image::{ImageBuffer, Luma};
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split, View};
 use nightsplat_photographs::image::{Image, ImageFile};
 use serde_json::{Value, json};
+use zip::write::{SimpleFileOptions, ZipWriter};
 
-pub(crate) use crate::common::command::Folder;
+pub(crate) use crate::common::Folder;
 
 pub(crate) const SIZE: (u32, u32) = (40, 30);
 pub(crate) const FOCAL: DVec2 = DVec2::new(35.0, 36.0);
@@ -49,6 +55,19 @@ pub(crate) fn photographs(
             SIZE,
             gain * dark(index),
         );
+    }
+}
+
+/// Nine photographs that are black beyond this distance from their middle.
+pub(crate) fn circles(root: &Path, radius: f64) {
+    fs::create_dir_all(root.join("images")).unwrap();
+    for index in 0..9 {
+        let image = Image::from_fn(SIZE.0, SIZE.1, |x, y| {
+            let (from_x, from_y) = (f64::from(x) - 19.5, f64::from(y) - 14.5);
+            let value = 0.04 + 0.05 * ((x + 3 * y + 2 * index) % 7) as f32 / 7.0;
+            [if from_x.hypot(from_y) < radius { value } else { 0.0 }; 3]
+        });
+        image.save_png8(root.join(format!("images/v0{index}.png"))).unwrap();
     }
 }
 
@@ -237,4 +256,70 @@ fn quaternion_and_translation(pose: &DAffine3) -> [f64; 7] {
     let rotation = glam::DQuat::from_mat3(&pose.matrix3);
     let t = pose.translation;
     [rotation.w, rotation.x, rotation.y, rotation.z, t.x, t.y, t.z]
+}
+
+/// Puts an orientation into a JPEG's Exif.
+pub(crate) fn orient(path: &Path, orientation: u8) {
+    let bytes = fs::read(path).unwrap();
+    let exif = [
+        b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".as_slice(),
+        &[orientation, 0, 0, 0],
+        &[0; 4],
+    ];
+    let exif = exif.concat();
+    let segment = [&[0xFF, 0xE1][..], &(exif.len() as u16 + 2).to_be_bytes(), &exif].concat();
+    fs::write(path, [&bytes[..2], &segment, &bytes[2..]].concat()).unwrap();
+}
+
+/// Packs a folder into an archive, below `prefix`.
+pub(crate) fn pack(from: &Path, zip: &Path, prefix: &str) {
+    let mut writer = ZipWriter::new(File::create(zip).unwrap());
+    let packed = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Deflated);
+    let mut folders = vec![from.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(&folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            let name = path.strip_prefix(from).unwrap().to_str().unwrap();
+            writer.start_file(format!("{prefix}{name}"), packed).unwrap();
+            writer.write_all(&fs::read(&path).unwrap()).unwrap();
+        }
+    }
+    writer.start_file("__MACOSX/._x.png", packed).unwrap();
+    writer.finish().unwrap();
+}
+
+pub(crate) fn load(root: &Path) -> Dataset {
+    load_with(root, LoadOptions::default())
+}
+
+pub(crate) fn load_with(root: &Path, options: LoadOptions) -> Dataset {
+    Dataset::load(root, &options).unwrap()
+}
+
+pub(crate) fn names(dataset: &Dataset, split: Split) -> Vec<&str> {
+    dataset.views.iter().filter(|view| view.split == split).map(|view| view.name.as_str()).collect()
+}
+
+pub(crate) fn view<'a>(dataset: &'a Dataset, name: &str) -> &'a View {
+    dataset.views.iter().find(|view| view.name == name).unwrap()
+}
+
+/// A JPEG of one grey with an orientation in its Exif.
+pub(crate) fn jpeg(path: &Path, (width, height): (u32, u32), orientation: u8) {
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    ImageBuffer::from_fn(width, height, |x, _| Luma([20 + (x > width / 2) as u8 * 20]))
+        .save(path)
+        .unwrap();
+    orient(path, orientation);
+}
+
+/// The left half of the image is white.
+pub(crate) fn half_mask(path: &Path, size: (u32, u32)) {
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    let half = |x: u32, _| [f32::from(2 * x < size.0); 3];
+    Image::from_fn(size.0, size.1, half).save_png8(path).unwrap();
 }

@@ -1,11 +1,5 @@
 //! Folders as left by tools, and listings from another machine.
 
-use std::fs::File;
-use std::io::Write;
-
-use nightsplat_diagnose::Diagnosis;
-use zip::write::{SimpleFileOptions, ZipWriter};
-
 use super::*;
 
 /// Nine views, each with its photograph and camera, and the points of the model.
@@ -294,27 +288,6 @@ fn hidden_files_are_not_photographs() {
     assert_eq!(lines, "");
 }
 
-/// Packs a folder into an archive, below `prefix`.
-pub(super) fn pack(from: &Path, zip: &Path, prefix: &str) {
-    let mut writer = ZipWriter::new(File::create(zip).unwrap());
-    let packed = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Deflated);
-    let mut folders = vec![from.to_owned()];
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(&folder).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-                continue;
-            }
-            let name = path.strip_prefix(from).unwrap().to_str().unwrap();
-            writer.start_file(format!("{prefix}{name}"), packed).unwrap();
-            writer.write_all(&fs::read(&path).unwrap()).unwrap();
-        }
-    }
-    writer.start_file("__MACOSX/._x.png", packed).unwrap();
-    writer.finish().unwrap();
-}
-
 #[test]
 fn an_archive_is_read_in_place() {
     let folder = Folder::empty();
@@ -362,19 +335,8 @@ fn a_dataset_below_or_above_is_named() {
 #[test]
 fn black_borders_of_undistorted_photographs_are_masked_but_not_those_of_a_dark_scene() {
     let folder = Folder::empty();
-    let paint = |corner: f64, shift: u32| {
-        for index in 0..9 {
-            let image = Image::from_fn(SIZE.0, SIZE.1, |x, y| {
-                let (from_x, from_y) = (f64::from(x) - 19.5, f64::from(y) - 14.5);
-                let value = 0.04 + 0.05 * ((x + 3 * y + shift * index) % 7) as f32 / 7.0;
-                [if from_x.hypot(from_y) < corner { value } else { 0.0 }; 3]
-            });
-            image.save_png8(folder.join(format!("images/v0{index}.png"))).unwrap();
-        }
-    };
-    fs::create_dir_all(folder.join("images")).unwrap();
     model(9).write_binary(&folder.join("sparse/0"));
-    paint(20.0, 2);
+    circles(&folder, 20.0);
     let lines = warnings(|| {
         for view in &load(&folder).views {
             let mask = view.mask.as_ref().unwrap();
@@ -382,21 +344,9 @@ fn black_borders_of_undistorted_photographs_are_masked_but_not_those_of_a_dark_s
         }
     });
     says(&lines, &["black in the same place at the border", "masked"]);
-    // Photographs that are read again are measured without their borders as well.
-    let options = LoadOptions::default();
-    let (dataset, loaded) = Diagnosis::load(&folder, &options).unwrap();
-    assert!(loaded.views[0].zero_fraction == 0.0, "{}", loaded.views[0].zero_fraction);
-    assert_eq!(Diagnosis::new(&dataset, &options).unwrap(), loaded);
-    {
-        let apply = format!("tone apply {} --curve ap3 --json", folder.display());
-        let (report, _) = run(&apply, 0);
-        let report: Value = serde_json::from_str(&report).unwrap();
-        let p10 = report["views"]["v00"]["p10"].as_f64().unwrap();
-        assert!(p10 > 0.03, "{report}");
-    }
     let options = LoadOptions { mask_borders: false, ..Default::default() };
     assert!(load_with(&folder, options).views.iter().all(|view| view.mask.is_none()));
-    paint(100.0, 2);
+    circles(&folder, 100.0);
     assert!(load(&folder).views.iter().all(|view| view.mask.is_none()));
 }
 

@@ -1,9 +1,10 @@
 //! Curves from files: TOML settings, CSV and .cube tables, and errors in them.
 
-use nightsplat::Error;
-use nightsplat_photographs::tone::{CurveChoice, Family, Table, Tone};
+use std::fs;
+use std::path::PathBuf;
 
-use crate::common::prelude::*;
+use nightsplat_core::Error;
+use nightsplat_photographs::tone::{CurveChoice, Family, Table, Tone, ToneCurve, ToneSettings};
 
 /// A curve read from a file with this name and text.
 fn load(name: &str, text: &str) -> Result<ToneSettings, Error> {
@@ -48,28 +49,6 @@ fn tables_are_read_from_csv_and_cube() {
     let table = table_of(settings);
     assert_eq!((table.is_of_stored, table.x.as_slice()), (true, &[0.0, 1.0, 2.0][..]));
     assert_eq!(table.y[2], [0.0, 0.7, 1.0]);
-}
-
-#[test]
-fn a_configuration_contains_the_whole_curve() {
-    let csv = load("a.csv", "0,0.1\n0.30000000000000004,0.7\n1,1\n").unwrap();
-    let constants = vec![0.1 + 0.2, -1.0 / 3.0, 1.0, 1e-3];
-    let cubic = ToneSettings { constants, ..ToneSettings::new(ToneCurve::FittedCubic) };
-    for tone in [csv, cubic, ToneSettings::new(ToneCurve::PerChannel)] {
-        let config = TrainConfig { tone, ..TrainConfig::bare() };
-        let text = config.to_toml().unwrap();
-        assert_eq!(toml::from_str::<TrainConfig>(&text).unwrap(), config, "{text}");
-        // A run's configuration is also a curve file.
-        assert_eq!(load("config.toml", &text).unwrap(), config.tone);
-    }
-}
-
-#[test]
-fn configurations_of_earlier_versions_load() {
-    let text = "steps = 7\n[tone]\ncurve = \"ase\"\ngain_c = 3.0\ntheta = 0.49\nalpha = 0.12\nbeta = 2.5\n\
-                base_gain = 1.0\n";
-    let config: TrainConfig = toml::from_str(text).unwrap();
-    assert_eq!(config.tone, ToneSettings::new(ToneCurve::Ase));
 }
 
 #[test]

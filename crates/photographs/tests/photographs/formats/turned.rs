@@ -3,8 +3,6 @@
 
 use nightsplat_photographs::dataset::PixelOrientation;
 
-use super::photographs::orient;
-
 use super::*;
 
 const VIEWS: usize = 9;
@@ -177,20 +175,4 @@ fn a_photograph_whose_size_tells_speaks_for_those_whose_size_does_not() {
         let (dataset, message) = loaded(root, PixelOrientation::Auto);
         assert!(are_right(&dataset, WIDE) && message.is_empty(), "{of_exif} {message}");
     }
-}
-
-#[test]
-fn the_configuration_keeps_the_option() {
-    let root = &Folder::empty();
-    capture(root, WIDE, HALF_TURN, true, false);
-    let diagnose = format!("diagnose {}", root.display());
-    assert!(run(&diagnose, 0).1.contains("--orientation exif"));
-    let (_, log) = run(&format!("{diagnose} --orientation exif"), 0);
-    assert!(!log.contains("Exif"), "{log}");
-    let line = format!("train {} --out {}/run --explain", root.display(), root.display());
-    let (explained, _) = run(&format!("{line} --orientation exif"), 0);
-    let kept = explained.lines().find(|line| line.contains("orientation")).unwrap();
-    says(kept, &["exif", "--orientation"]);
-    let (_, refused) = run(&format!("{line} --orientation upright"), 2);
-    says(&refused, &["auto, stored, exif"]);
 }

@@ -100,38 +100,6 @@ fn pixels_of_an_exr_that_are_not_finite_are_masked() {
 }
 
 #[test]
-fn heic_is_refused_with_its_converter_and_listed_as_unread() {
-    let root = &Folder::empty();
-    fs::write(root.join("a.heic"), b"\0\0\0\x18ftypheic\0\0\0\0mif1heic").unwrap();
-    photograph(&root.join("b.png"), SIZE, 0.1);
-    root.refused("tone apply @a.heic", 3, &["a.heic", "HEIC", "heif-convert", "sips"]);
-    let (_, message) = root.run("tone apply @", 0);
-    says(&message, &["not read: 1 .heic", "heif-convert"]);
-}
-
-/// A JPEG of one grey with an orientation in its Exif.
-fn jpeg(path: &Path, (width, height): (u32, u32), orientation: u8) {
-    fs::create_dir_all(path.parent().unwrap()).unwrap();
-    ImageBuffer::from_fn(width, height, |x, _| Luma([20 + (x > width / 2) as u8 * 20]))
-        .save(path)
-        .unwrap();
-    orient(path, orientation);
-}
-
-/// Puts an orientation into a JPEG's Exif.
-pub(crate) fn orient(path: &Path, orientation: u8) {
-    let bytes = fs::read(path).unwrap();
-    let exif = [
-        b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".as_slice(),
-        &[orientation, 0, 0, 0],
-        &[0; 4],
-    ];
-    let exif = exif.concat();
-    let segment = [&[0xFF, 0xE1][..], &(exif.len() as u16 + 2).to_be_bytes(), &exif].concat();
-    fs::write(path, [&bytes[..2], &segment, &bytes[2..]].concat()).unwrap();
-}
-
-#[test]
 fn a_photograph_is_rotated_if_its_camera_is_upright_and_else_kept_as_stored() {
     // For each orientation: as stored if the cameras' size is 40 x 30.
     for orientation in 1..=8 {
@@ -200,13 +168,6 @@ fn up_is_that_of_the_upright_photographs() {
     }
 }
 
-/// The left half of the image is white.
-fn half_mask(path: &Path, size: (u32, u32)) {
-    fs::create_dir_all(path.parent().unwrap()).unwrap();
-    let half = |x: u32, _| [f32::from(2 * x < size.0); 3];
-    Image::from_fn(size.0, size.1, half).save_png8(path).unwrap();
-}
-
 fn hides_the_right(mask: &Mask) {
     assert_eq!((mask.width, mask.height), SIZE);
     let columns = mask.weights[..40].iter().map(|&weight| weight as u32).sum::<u32>();
@@ -256,22 +217,4 @@ fn a_mask_of_another_aspect_ratio_is_refused_and_a_full_mask_excludes_its_view()
     );
     half_mask(&root.join("masks/v01.png"), (30, 30));
     refuses(root, &["masks/v01.png: is 30x30, its photograph 40x30"]);
-    root.refused("diagnose @", 3, &["masks/v01.png"]);
-}
-
-#[test]
-fn masked_pixels_are_not_in_the_statistics_of_tone() {
-    let root = &Folder::empty();
-    let measured = |more: &str| -> Value {
-        let (stdout, _) = run(&format!("tone apply {} --json{more}", root.display()), 0);
-        serde_json::from_str(&stdout).unwrap()
-    };
-    let halves = |x: u32, _| [if 2 * x < SIZE.0 { 0.1 } else { 0.9 }; 3];
-    Image::from_fn(SIZE.0, SIZE.1, halves).save_png8(root.join("a.png")).unwrap();
-    let mean = |json: &Value| (json["scene"]["mean"].as_f64().unwrap() * 100.0).round();
-    assert_eq!(mean(&measured("")), 50.0);
-    half_mask(&root.join("masks/a.png"), SIZE);
-    assert_eq!(mean(&measured("")), 10.0);
-    assert_eq!(measured("")["scene"]["unusable_pixels"], json!(600));
-    assert_eq!(mean(&measured(" --invert-masks")), 90.0);
 }

@@ -1,9 +1,10 @@
 //! The synthetic sets whose cameras carry a lamp.
 
-use nightsplat_photographs::dataset::LoadOptions;
+use std::path::Path;
 
-use crate::common::command::{refused, run};
-use crate::common::prelude::*;
+use nightsplat_photographs::dataset::{Dataset, LoadOptions};
+use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb};
+use nightsplat_synth::{Capture, SyntheticOptions};
 
 fn set() -> SyntheticOptions {
     let lamp = Some(16.0);
@@ -126,28 +127,4 @@ fn a_point_is_brighter_from_nearby_and_on_the_axis() {
     }
     assert!(pairs > 1000, "{pairs}");
     assert!(f64::from(as_expected) > 0.9 * f64::from(pairs), "{as_expected} of {pairs}");
-}
-
-#[test]
-fn a_lamp_that_cannot_be_made_is_refused_in_one_line() {
-    let folder = tempfile::tempdir().unwrap();
-    let set = folder.path().join("set");
-    for degrees in ["4", "81", "NaN", "-3"] {
-        refused(&format!("synth {} --lamp={degrees}", set.display()), 2, &["5 to 80", degrees]);
-        assert!(!set.exists());
-    }
-}
-
-#[test]
-fn the_command_makes_the_same_set_twice() {
-    let folder = tempfile::tempdir().unwrap();
-    let size = "--views 3 --width 24 --height 16";
-    for (name, lamp) in [("a", "--lamp"), ("b", "--lamp=16"), ("c", "--lamp=40 --fisheye")] {
-        run(&format!("synth {} {size} {lamp}", folder.path().join(name).display()), 0);
-    }
-    for file in ["low/001.png", "high/001.png", "lit/000.png", "colmap_sparse/0/points3D.txt"] {
-        let [a, b, c] = ["a", "b", "c"].map(|set| fs::read(folder.path().join(set).join(file)));
-        let [a, b, c] = [a.unwrap(), b.unwrap(), c.unwrap()];
-        assert!(a == b && b != c, "{file}");
-    }
 }

@@ -4,11 +4,6 @@ use nightsplat_core::camera::Camera;
 
 use super::*;
 
-/// The standard error of `tone apply` for a dataset; one line for each remark.
-fn message_of(root: &Path) -> String {
-    run(&format!("tone apply {} --json", root.display()), 0).1
-}
-
 #[test]
 fn of_several_models_the_one_with_the_most_photographs_is_used_and_named() {
     let root = &Folder::empty();
@@ -19,11 +14,12 @@ fn of_several_models_the_one_with_the_most_photographs_is_used_and_named() {
     let mut absent = model(20);
     absent.images.iter_mut().for_each(|image| image.3 = format!("absent/{}", image.3));
     absent.write_text(&root.join("sparse/2"));
-    let dataset = load(root);
-    assert_eq!(dataset.views.len(), 9);
-    assert_eq!(dataset.points.len(), 20);
-    assert!(dataset.points[0].views.len() > 2);
-    let message = message_of(root);
+    let message = warnings(|| {
+        let dataset = load(root);
+        assert_eq!(dataset.views.len(), 9);
+        assert_eq!(dataset.points.len(), 20);
+        assert!(dataset.points[0].views.len() > 2);
+    });
     says(&message, &["3 models, of 2, 9, 0 photographs; sparse/1, the largest"]);
 }
 
@@ -35,7 +31,7 @@ fn photographs_without_a_pose_and_files_that_are_not_read_are_counted() {
     fs::write(root.join("images/IMG_1.HEIC"), "").unwrap();
     fs::write(root.join("images/clip.mp4"), "").unwrap();
     fs::write(root.join("images/notes.txt"), "").unwrap();
-    let message = message_of(root);
+    let message = warnings(|| drop(load(root)));
     let parts = [
         "6 of 9 photographs have no pose",
         "v03.png the first",
@@ -51,7 +47,7 @@ fn photographs_without_a_pose_and_files_that_are_not_read_are_counted() {
     model(9).write_text(&root.join("sparse/0"));
     fs::remove_file(root.join("images/IMG_1.HEIC")).unwrap();
     fs::remove_file(root.join("images/clip.mp4")).unwrap();
-    assert_eq!(message_of(root), "");
+    assert_eq!(warnings(|| drop(load(root))), "");
 }
 
 #[test]
@@ -178,11 +174,10 @@ fn the_part_of_a_fisheye_beyond_a_pinhole_is_cropped_with_a_remark() {
         "camera_model": "OPENCV_FISHEYE", "fl_x": 16.0, "fl_y": 16.0, "cx": 20.0, "cy": 15.0, "k1": 0.01,
     });
     let root = &Folder::with_listing(9, |listing| extend(listing, &lens));
-    let camera = undistorted(root).views[0].camera;
+    let mut camera = None;
+    let message = warnings(|| camera = Some(undistorted(root).views[0].camera));
+    let camera = camera.unwrap();
     let corner = (DVec2::new(0.5, 0.5) - camera.principal_point) / camera.focal;
     assert!((corner.length().atan().to_degrees() - 60.0).abs() < 0.01, "{camera:?}");
-    let (shown, out) = (root.display(), root.join("run"));
-    let train = format!("train {shown} --steps 1 --undistort --out {}", out.display());
-    let message = run(&train, 0).1;
     says(&message, &["fisheye", "60 degrees"]);
 }

@@ -1,10 +1,10 @@
 //! The synthetic street: its light falls along it, and a view sees a part of it.
 
-use nightsplat_photographs::dataset::LoadOptions;
-use nightsplat_synth::DARKENING;
+use std::path::Path;
 
-use crate::common::command::run;
-use crate::common::prelude::*;
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb};
+use nightsplat_synth::{DARKENING, SyntheticOptions};
 
 /// The plots of the street.
 const PLOTS: u32 = 12;
@@ -105,19 +105,4 @@ fn every_eighth_view_is_a_test_view_and_they_are_all_along_the_street_and_in_eve
         assert_eq!(in_lane, 3, "lane {lane}");
     }
     assert!(centers[0].x < 0.5 && centers[8].x > 10.0, "{centers:?}");
-}
-
-#[test]
-fn the_command_makes_six_views_of_128x96_a_plot_unless_told_otherwise() {
-    let dir = tempfile::tempdir().unwrap();
-    let set = dir.path().join("set");
-    let line = run(&format!("synth {} --street 1", set.display()), 0).0;
-    assert!(line.contains("6 views of 128x96"), "{line}");
-    let other = dir.path().join("other");
-    let line =
-        run(&format!("synth {} --street 2 --views 4 --width 32 --height 16", other.display()), 0).0;
-    assert!(line.contains("4 views of 32x16"), "{line}");
-    let refused =
-        run(&format!("synth {} --street 2 --fisheye", dir.path().join("none").display()), 2).1;
-    assert!(refused.contains("--fisheye"), "{refused}");
 }

@@ -1,10 +1,9 @@
 //! Night captures of the synthetic scenes: what a scene has at night, and what a camera does wrong there.
 
-use nightsplat_synth::{self, CameraFaults, DARKENING, Night};
+use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb};
+use nightsplat_synth::{self, CameraFaults, Capture, DARKENING, Night, SyntheticOptions};
 
-use crate::common::command::{refused, run};
 use crate::common::fixture;
-use crate::common::prelude::*;
 
 const VIEWS: usize = 9;
 const WIDTH: u32 = 80;
@@ -171,33 +170,6 @@ fn night_mode_lights_half_of_the_views_and_half_of_the_test_views() {
         let expected = if [1, 3, 5, 7, 8].contains(&view) { 1.0 } else { DARKENING };
         assert!((factor / expected - 1.0).abs() < 0.1, "{view}: {factors:?}");
     }
-}
-
-#[test]
-fn the_command_makes_the_same_night_twice_and_refuses_what_cannot_be() {
-    let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name).display().to_string();
-    let options = "--views 3 --width 80 --height 60 --bands --brackets";
-    for (name, more) in [
-        ("a", "--sky --headlights"),
-        ("b", "--sky --headlights"),
-        ("c", "--haze --seed 1"),
-        ("d", ""),
-    ] {
-        run(&format!("synth {} {options} {more}", at(name)), 0);
-    }
-    for file in ["low/001.png", "high/001.png", "colmap_sparse/0/points3D.txt"] {
-        let [a, b, c, d] =
-            ["a", "b", "c", "d"].map(|set| fs::read(folder.path().join(set).join(file)).unwrap());
-        assert!(a == b && a != c && a != d, "{file}");
-    }
-    let lights =
-        [0, 1, 2].map(|view| light(&Image::load(at(&format!("d/low/{view:03}.png"))).unwrap()));
-    for pair in lights.windows(2) {
-        assert!((3.0..5.0).contains(&(pair[1] / pair[0])), "{lights:?}");
-    }
-    refused(&format!("synth {} --brackets=nan", at("none")), 2, &["-10 to 10"]);
-    refused(&format!("synth {} --lamp --sky", at("none")), 2, &["leave out --lamp"]);
 }
 
 /// The committed set is older than the nights.

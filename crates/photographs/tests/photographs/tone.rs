@@ -1,11 +1,16 @@
 //! Tone curves and their statistics, against the paper and by their properties.
 
-use nightsplat::Error;
-use nightsplat_photographs::tone::{GainChoice, Tone, ToneParameters, percentiles};
+use std::fs;
+use std::path::{Path, PathBuf};
 
-use crate::common::command::says;
-use crate::common::fixture;
-use crate::common::prelude::*;
+use nightsplat_core::Error;
+use nightsplat_photographs::image::{Image, ImageFile as _};
+use nightsplat_photographs::tone::{
+    GainChoice, Statistics, Tone, ToneCurve, ToneParameters, ToneSettings, percentiles,
+};
+use serde_json::Value;
+
+use crate::common::{fixture, says, shared};
 
 /// The paper's curves and none, which the loss evaluates directly.
 const PAPER: [ToneCurve; 4] = [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::None];

@@ -1,14 +1,16 @@
 //! Camera profiles: the true profile is recovered for any exposure, and bad pairs are named.
 
+use std::fs;
 use std::path::Path;
 
+use nightsplat_core::random::Stream;
 use nightsplat_fit::{
     ColourPair, ColourScene, cross_validate_profile, fit_profile, profile_scores,
 };
-use nightsplat_photographs::image::ImageFile as _;
+use nightsplat_photographs::image::{Image, ImageFile as _};
 use nightsplat_photographs::tone::Profile;
 
-use super::*;
+use crate::pairs::dark;
 
 /// Mixes channels, and bends each differently.
 fn truth() -> Profile {
