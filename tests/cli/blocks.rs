@@ -1,6 +1,7 @@
 //! Scenes in blocks: plan, run, join, and what is refused.
 
 use crate::common::command::{Folder, json};
+use crate::common::contents;
 use crate::common::prelude::*;
 
 const PLAN: &str = "--blocks 2 --steps 120 --seed 3 --sh-degree 1 --max-gaussians 3000 --plan none";
@@ -26,24 +27,6 @@ fn copied() -> Folder {
     Folder::copy_of(&shared().join("city"))
 }
 
-/// The bytes of every file below a folder.
-fn files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
-    let mut found = vec![];
-    let mut folders = vec![folder.to_owned()];
-    while let Some(next) = folders.pop() {
-        for path in fs::read_dir(next).unwrap().map(|entry| entry.unwrap().path()) {
-            if path.is_dir() {
-                folders.push(path);
-            } else {
-                let name = path.strip_prefix(folder).unwrap().to_owned();
-                found.push((name, fs::read(path).unwrap()));
-            }
-        }
-    }
-    found.sort();
-    found
-}
-
 #[test]
 fn a_plan_has_the_same_bytes_on_any_number_of_threads_and_may_be_made_again() {
     let shared = shared();
@@ -53,7 +36,7 @@ fn a_plan_has_the_same_bytes_on_any_number_of_threads_and_may_be_made_again() {
         assert!(output.status.success(), "{output:?}");
     }
     shared.succeed(&plan("two", PLAN));
-    let [one, two] = ["one", "two"].map(|out| files(&shared.path(out)));
+    let [one, two] = ["one", "two"].map(|out| contents(&shared.path(out)));
     assert_eq!(one.len(), 5 * 3 + 5, "{:?}", one.iter().map(|(name, _)| name).collect::<Vec<_>>());
     assert!(one == two, "another plan");
 }
@@ -62,7 +45,7 @@ fn a_plan_has_the_same_bytes_on_any_number_of_threads_and_may_be_made_again() {
 fn a_dry_run_writes_nothing() {
     let dry = plan("dry", &format!("{PLAN} --dry-run"));
     let text = shared().succeed(&dry);
-    assert!(text.contains("2 blocks, each with") && text.contains("120 steps of"), "{text}");
+    says(&text, &["2 blocks, each with", "120 steps of"]);
     let json = json(shared().succeed(&format!("{dry} --json")));
     assert_eq!(json["block"].as_array().unwrap().len(), 4);
     let steps = |row: &Value| row["steps"].as_u64().unwrap();
@@ -145,10 +128,10 @@ fn what_is_done_is_not_done_again_and_what_was_killed_gives_the_same_model() {
 /// Joins a damaged copy of the plan, which must fail with one line and leave the joined model as it is.
 fn refuses_to_join(parts: &[&str], damage: impl FnOnce(&Folder)) {
     let copy = copied();
-    let before = files(&copy.path("model"));
+    let before = contents(&copy.path("model"));
     damage(&copy);
     copy.refused("blocks join @", 3, parts);
-    assert!(files(&copy.path("model")) == before);
+    assert!(contents(&copy.path("model")) == before);
 }
 
 #[test]
@@ -180,7 +163,7 @@ fn block(path: &Path) -> PathBuf {
 fn a_full_disk_stops_a_join_with_one_line_and_leaves_no_manifest_until_there_is_room() {
     let folder = copied();
     let model = folder.path("model");
-    let before = files(&folder);
+    let before = contents(&folder);
     // Anew, and in place of an earlier model: from its first to its last file.
     for is_anew in [true, false] {
         for file in ["model/0/0000.ply", "model/0/0001.ply", "model/manifest.json"] {
@@ -197,7 +180,7 @@ fn a_full_disk_stops_a_join_with_one_line_and_leaves_no_manifest_until_there_is_
             // No command takes it for a model.
             folder.refused("eval @", 3, &[&folder.display().to_string()]);
             folder.succeed("blocks join @");
-            assert!(files(&folder) == before, "{file}: another model once there is room");
+            assert!(contents(&folder) == before, "{file}: another model once there is room");
         }
     }
 }
@@ -210,7 +193,7 @@ fn a_full_disk_stops_an_export_of_tiles_with_one_line_and_leaves_no_index_until_
     let options = "--format streamed-sog --levels 2 --chunk 1000 --out @streamed-full";
     let export = format!("export @city {options}");
     shared.succeed(&export);
-    let before = files(&out);
+    let before = contents(&out);
     // Limits the size of files, as on a full disk.
     let program = shared.command("").get_program().to_str().unwrap().to_owned();
     let line = format!("trap '' XFSZ; ulimit -f 4; exec {program} {}", shared.named(&export));
@@ -223,7 +206,7 @@ fn a_full_disk_stops_an_export_of_tiles_with_one_line_and_leaves_no_index_until_
     // As a killed export leaves it.
     fs::write(out.join("lod-meta.json.partial"), "{").unwrap();
     shared.succeed(&export);
-    assert!(files(&out) == before, "another model once there is room");
+    assert!(contents(&out) == before, "another model once there is room");
 }
 
 #[test]
@@ -277,8 +260,7 @@ fn a_law_is_read_in_place_of_measuring_and_one_of_another_set_is_refused() {
     let shared = shared();
     let given = "--law @city/law.toml --frame @city/frame.toml --steps 1 --plan none";
     shared.succeed(&format!("train @street --out @by-law {given}"));
-    let config = shared.text("by-law/config.toml");
-    assert!(config.contains("law.toml") && config.contains("extent = "), "{config}");
+    says(&shared.text("by-law/config.toml"), &["law.toml", "extent = "]);
     let law = shared.text("city/law.toml");
     let short: Vec<&str> = law.lines().filter(|line| !line.starts_with("005 ")).collect();
     shared.write("short.toml", short.join("\n"));

@@ -21,7 +21,7 @@ fn without_a_terminal_intermediate_scores_are_lines() {
     let (stdout, stderr) = trained("--progress none");
     assert!(!stderr.contains("step ") && !stderr.contains("memory"), "{stderr}");
     assert!(stdout.contains("6 steps") && !stdout.contains("views of"), "{stdout}");
-    assert!(stdout.contains("wrote ") && stdout.contains("next: nightsplat export "), "{stdout}");
+    says(&stdout, &["wrote ", "next: nightsplat export "]);
 }
 
 #[test]

@@ -103,8 +103,8 @@ fn a_finished_point_is_never_trained_twice_and_a_killed_one_is_resumed() {
     assert!(!sweep.path("sweep.toml").exists(), "--dry-run writes nothing");
 
     let (shown, message) = run(&sweep.arguments, 0);
-    assert!(shown.contains("PSNR, dB") && shown.contains("index.html"), "{shown}");
-    assert!(message.contains("1 of 4: curve=") && message.contains("4 of 4: curve="), "{message}");
+    says(&shown, &["PSNR, dB", "index.html"]);
+    says(&message, &["1 of 4: curve=", "4 of 4: curve="]);
     let leaderboard = sweep.leaderboard();
     let [csv, markdown, html] = &leaderboard;
     let lines: Vec<&str> = csv.lines().collect();
@@ -353,8 +353,7 @@ fn without_references_test_views_are_scored_against_their_own_targets() {
 fn train_sets_any_setting_by_its_path() {
     let folder = Folder::empty();
     let train = format!("train {} --out @run", set().display());
-    let (_, message) = folder.run(&format!("{train} --set density.grad=1"), 2);
-    says(&message, &["density.grad", "nearest"]);
+    says(&folder.run(&format!("{train} --set density.grad=1"), 2).1, &["density.grad", "nearest"]);
     let settings = "--steps 9 --set steps=1 --set tone.alpha=0.2 --set background=black";
     folder.succeed(&format!("{train} {settings}"));
     let lines =

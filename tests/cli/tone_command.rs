@@ -5,7 +5,6 @@ use nightsplat::cli::tone::apply::{ApplyArgs, ToneReport, apply};
 use nightsplat_photographs::image::srgb_from_linear;
 use nightsplat_photographs::metrics::psnr;
 
-use crate::common::command::succeed;
 use crate::common::prelude::*;
 
 #[derive(Debug, clap::Parser)]
@@ -26,6 +25,16 @@ fn args(input: &Path, out: &Path, options: &str) -> ApplyArgs {
     automatic(input, &format!("--out {} {curve} {options}", out.display()))
 }
 
+/// A folder with one of photographs in `photographs`.
+fn folder_of(photographs: &[(&str, Image)]) -> Folder {
+    let folder = Folder::empty();
+    fs::create_dir(folder.join("photographs")).unwrap();
+    for (name, image) in photographs {
+        image.save_png8(folder.join("photographs").join(name)).unwrap();
+    }
+    folder
+}
+
 /// A dark gradient.
 fn dark(width: u32, height: u32) -> Image {
     Image::from_fn(width, height, |x, y| [x, y, x + y].map(|v| (v % 32) as f32 / 255.0))
@@ -33,16 +42,14 @@ fn dark(width: u32, height: u32) -> Image {
 
 #[test]
 fn a_folder_is_mapped_by_name_and_unreadable_files_are_left_out() {
-    let dir = tempfile::tempdir().unwrap();
-    let photographs = dir.path().join("photographs");
-    fs::create_dir(&photographs).unwrap();
-    dark(40, 30).save_png8(photographs.join("a.PNG")).unwrap();
+    let dir = folder_of(&[("a.PNG", dark(40, 30))]);
+    let photographs = dir.join("photographs");
     dark(7, 90).save_png16(photographs.join("b.png")).unwrap();
     dark(16, 16).save_exr(photographs.join("c.exr")).unwrap();
     fs::write(photographs.join("broken.jpg"), b"no image").unwrap();
     fs::write(photographs.join("notes.txt"), b"no image either").unwrap();
     for curve in [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Hybrid] {
-        let out = dir.path().join(curve.name());
+        let out = dir.join(curve.name());
         let args = args(&photographs, &out, &format!("--curve {curve} --gain 2 --theta 0.4"));
         let views = apply(&args).unwrap().views;
         assert_eq!(views.keys().collect::<Vec<_>>(), ["a", "b", "c"]);
@@ -69,20 +76,20 @@ fn a_folder_is_mapped_by_name_and_unreadable_files_are_left_out() {
 
 #[test]
 fn exr_is_not_rounded_and_what_is_near_white_is_counted() {
-    let dir = tempfile::tempdir().unwrap();
-    let photograph = dir.path().join("one.png");
+    let dir = Folder::empty();
+    let photograph = dir.join("one.png");
     let mut image = dark(10, 10);
     image.data[..30].fill(1.0);
     image.save_png8(&photograph).unwrap();
     let image = Image::load(&photograph).unwrap();
-    let out = dir.path().join("out");
+    let out = dir.join("out");
     let linear = args(&photograph, &out, "--curve linear --format exr");
     let views = apply(&linear).unwrap().views;
     let settings = ToneSettings::new(ToneCurve::Linear);
     let parameters = settings.parameters(&Statistics::new(&image.data));
     let expected: Vec<f32> =
         image.data.iter().map(|&x| settings.curve.apply(x, &parameters)).collect();
-    let mapped = Image::load(dir.path().join("out/one.exr")).unwrap();
+    let mapped = Image::load(dir.join("out/one.exr")).unwrap();
     for (a, b) in mapped.data.iter().zip(&expected) {
         assert!((a - b).abs() < 1e-5, "{a}, not {b}");
     }
@@ -94,8 +101,8 @@ fn exr_is_not_rounded_and_what_is_near_white_is_counted() {
 
 #[test]
 fn bad_input_is_named_in_one_line() {
-    let dir = tempfile::tempdir().unwrap();
-    let path = |name: &str| dir.path().join(name);
+    let dir = Folder::empty();
+    let path = |name: &str| dir.join(name);
     let out = path("out");
     let fails = |args: ApplyArgs, part: &str, code: u8| {
         let error = apply(&args).unwrap_err();
@@ -122,7 +129,7 @@ fn bad_input_is_named_in_one_line() {
     }
     dark(4, 4).save_png8(path("good.png")).unwrap();
     let before = fs::read(path("good.png")).unwrap();
-    fails(args(&path("good.png"), dir.path(), ""), "is one of the photographs", 1);
+    fails(args(&path("good.png"), &dir, ""), "is one of the photographs", 1);
     assert_eq!(fs::read(path("good.png")).unwrap(), before);
 
     fails(args(&path("good.png"), &path("broken.png"), ""), "cannot be created", 1);
@@ -146,15 +153,15 @@ fn pairs(dir: &Path) -> [PathBuf; 2] {
 
 #[test]
 fn references_give_scores_and_the_page_shows_the_distributions() {
-    let dir = tempfile::tempdir().unwrap();
-    let [low, high] = pairs(dir.path());
-    let page = dir.path().join("page.html");
+    let dir = Folder::empty();
+    let [low, high] = pairs(&dir);
+    let page = dir.join("page.html");
     let options = format!(
         "--reference {} --report {} --compare linear,lum_preserve",
         high.display(),
         page.display()
     );
-    let args = args(&low, &dir.path().join("out"), &options);
+    let args = args(&low, &dir.join("out"), &options);
     let output = apply(&args).unwrap();
     let scores: Vec<f64> = output.views.values().map(|view| view.scores.unwrap().psnr).collect();
     let mean = scores.iter().sum::<f64>() / 3.0;
@@ -174,25 +181,19 @@ fn references_give_scores_and_the_page_shows_the_distributions() {
     // A file of another size is not a reference.
     dark(9, 9).save_png8(high.join("b.png")).unwrap();
     let error = apply(&args).unwrap_err().to_string();
-    assert!(error.contains("b.png") && error.contains("9x9") && error.contains("45x30"), "{error}");
+    says(&error, &["b.png", "9x9", "45x30"]);
 }
 
 #[test]
 fn the_page_shows_every_photograph_and_tables_have_what_the_curve_uses() {
-    let dir = tempfile::tempdir().unwrap();
-    let folder = dir.path().join("dark");
-    fs::create_dir(&folder).unwrap();
-    for name in ["1", "2", "10", "11", "9"] {
-        dark(40, 30).save_png8(folder.join(format!("{name}.png"))).unwrap();
-    }
-    let table = dir.path().join("curve.csv");
-    fs::write(&table, "0,0\n1,0.7\n2,1\n").unwrap();
-    let (page, folder) = (dir.path().join("page.html"), folder.display());
+    let names = ["1.png", "2.png", "10.png", "11.png", "9.png"];
+    let dir = folder_of(&names.map(|name| (name, dark(40, 30))));
+    dir.write("curve.csv", "0,0\n1,0.7\n2,1\n");
     let printed = |curve: &str| {
-        succeed(&format!("tone apply {folder} --curve {curve} --report {}", page.display()))
+        dir.succeed(&format!("tone apply @photographs --curve {curve} --report @page.html"))
     };
     let ap3 = printed("ap3");
-    let html = fs::read_to_string(&page).unwrap();
+    let html = dir.text("page.html");
     assert_eq!(html.matches("data:image/jpeg").count(), 10, "five photographs, dark and lit");
     for text in [&ap3, &html] {
         let at = |name: &str| text.find(name).unwrap();
@@ -204,16 +205,16 @@ fn the_page_shows_every_photograph_and_tables_have_what_the_curve_uses() {
         };
         assert!(nine < ten, "{text}");
     }
-    let of_table = printed(&table.display().to_string());
+    let of_table = printed("@curve.csv");
     assert!(!of_table.contains("delta0") && !of_table.contains(" r "), "{of_table}");
 }
 
 #[test]
 fn scene_statistics_give_every_photograph_one_curve() {
-    let dir = tempfile::tempdir().unwrap();
-    let [low, _] = pairs(dir.path());
+    let dir = Folder::empty();
+    let [low, _] = pairs(&dir);
     dark(40, 30).save_png8(low.join("b.png")).unwrap();
-    let out = dir.path().join("out");
+    let out = dir.join("out");
     for scene_statistics in [false, true] {
         let options = if scene_statistics { "--scene-statistics" } else { "" };
         let args = args(&low, &out, &format!("--format exr {options}"));
@@ -236,10 +237,7 @@ fn scene_statistics_give_every_photograph_one_curve() {
 
 #[test]
 fn a_dataset_is_measured_on_training_views_and_scored_on_test_views() {
-    let dir = tempfile::tempdir().unwrap();
-    let set = dir.path().join("set");
-    let options = SyntheticOptions { width: 48, height: 36, ..Default::default() };
-    nightsplat_synth::write(&set, &options).unwrap();
+    let set = written(&SyntheticOptions { width: 48, height: 36, ..Default::default() });
     let output = apply(&automatic(&set, "--curve ap3")).unwrap();
     assert!(output.scene.scores.is_some());
     let (test, training): (Vec<ToneReport>, Vec<ToneReport>) =
@@ -251,41 +249,38 @@ fn a_dataset_is_measured_on_training_views_and_scored_on_test_views() {
 
 #[test]
 fn values_that_are_not_finite_are_counted_and_excluded_from_the_statistics() {
-    let dir = tempfile::tempdir().unwrap();
-    let path = dir.path().join("gaps.exr");
+    let dir = Folder::empty();
+    let path = dir.join("gaps.exr");
     let value = |x: usize| match x % 10 {
         3 => f32::NAN,
         5 => f32::INFINITY,
         _ => 0.01,
     };
     exr::prelude::write_rgb_file(&path, 40, 10, |x, _| (0.02, value(x), 0.03)).unwrap();
-    let clean = dir.path().join("clean.exr");
+    let clean = dir.join("clean.exr");
     exr::prelude::write_rgb_file(&clean, 32, 10, |_, _| (0.02_f32, 0.01, 0.03)).unwrap();
-    let run = |path: &Path| apply(&args(path, &dir.path().join("out"), "")).unwrap().scene;
+    let run = |path: &Path| apply(&args(path, &dir.join("out"), "")).unwrap().scene;
     let (found, expected) = (run(&path), run(&clean));
     assert_eq!((found.unusable_pixels, expected.unusable_pixels), (80, 0));
     assert_eq!((found.before.p10, found.before.p90), (expected.before.p10, expected.before.p90));
     assert!((found.before.mean_luminance - expected.before.mean_luminance).abs() < 1e-7);
 
     exr::prelude::write_rgb_file(&path, 4, 4, |_, _| (f32::NAN, 0.0, 0.0)).unwrap();
-    let error = apply(&args(&path, &dir.path().join("out"), "")).unwrap_err().to_string();
+    let error = apply(&args(&path, &dir.join("out"), "")).unwrap_err().to_string();
     assert!(error.contains("no finite, unmasked pixel"), "{error}");
 }
 
 #[test]
 fn degenerate_photographs_have_defined_results_under_every_kind_of_curve() {
-    let dir = tempfile::tempdir().unwrap();
-    let photographs = dir.path().join("photographs");
-    fs::create_dir(&photographs).unwrap();
-    for (name, size, value) in
-        [("black", 20, 0.0), ("white", 20, 1.0), ("grey", 20, 0.03), ("pixel", 1, 0.2)]
-    {
-        Image::filled(size, size, [value; 3])
-            .save_png8(photographs.join(name).with_extension("png"))
-            .unwrap();
-    }
-    let table = dir.path().join("curve.csv");
-    fs::write(&table, "0,0\n1,0.7\n2,1\n").unwrap();
+    let plain = |name, size, value| (name, Image::filled(size, size, [value; 3]));
+    let dir = folder_of(&[
+        plain("black.png", 20, 0.0),
+        plain("white.png", 20, 1.0),
+        plain("grey.png", 20, 0.03),
+        plain("pixel.png", 1, 0.2),
+    ]);
+    let (photographs, table) = (dir.join("photographs"), dir.join("curve.csv"));
+    dir.write("curve.csv", "0,0\n1,0.7\n2,1\n");
     let named = [
         ToneCurve::Linear,
         ToneCurve::Ap3,
@@ -296,7 +291,7 @@ fn degenerate_photographs_have_defined_results_under_every_kind_of_curve() {
     ];
     let table = table.display().to_string();
     for curve in named.map(|curve| curve.to_string()).into_iter().chain([table]) {
-        let args = args(&photographs, &dir.path().join("out"), &format!("--curve {curve}"));
+        let args = args(&photographs, &dir.join("out"), &format!("--curve {curve}"));
         let output = apply(&args).unwrap();
         let text = serde_json::to_string(&output).unwrap();
         assert!(!text.contains("null"), "{text}");
@@ -307,8 +302,8 @@ fn degenerate_photographs_have_defined_results_under_every_kind_of_curve() {
 
 #[test]
 fn the_automatic_curve_reports_its_brightness_which_other_curves_can_use() {
-    let dir = tempfile::tempdir().unwrap();
-    let [low, _] = pairs(dir.path());
+    let dir = Folder::empty();
+    let [low, _] = pairs(&dir);
     // Grey: the rule is about the curve of the luminance, which for colours differs from the luminance of the curve.
     for name in ["a", "b", "c"] {
         let path = low.join(name).with_extension("png");
@@ -345,12 +340,11 @@ fn the_automatic_curve_reports_its_brightness_which_other_curves_can_use() {
 
 #[test]
 fn targets_of_linear_light_are_equally_bright_for_any_exposure() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::empty();
     // Scene-referred light over two decades, as in camera RAW; the sensor receives a part of it.
     let light = |x: u32, y: u32| 10.0_f32.powf(-2.0 * ((7 * x + 11 * y) % 40) as f32 / 40.0);
     let target = |exposure: f32| {
-        let [folder, out] =
-            ["dark", "out"].map(|name| dir.path().join(format!("{name}{exposure}")));
+        let [folder, out] = ["dark", "out"].map(|name| dir.join(format!("{name}{exposure}")));
         fs::create_dir(&folder).unwrap();
         let photograph =
             Image::from_fn(40, 30, |x, y| [srgb_from_linear(exposure * light(x, y)); 3]);
@@ -375,12 +369,10 @@ fn targets_of_linear_light_are_equally_bright_for_any_exposure() {
 
 #[test]
 fn a_well_lit_folder_is_unchanged_and_a_black_one_refused() {
-    let dir = tempfile::tempdir().unwrap();
-    let folder = dir.path().join("bright");
-    fs::create_dir(&folder).unwrap();
     let bright = Image::from_fn(40, 30, |x, y| [x, y, x + y].map(|v| 0.3 + v as f32 / 120.0));
-    bright.save_png8(folder.join("a.png")).unwrap();
-    let out = dir.path().join("out");
+    let dir = folder_of(&[("a.png", bright)]);
+    let folder = dir.join("photographs");
+    let out = dir.join("out");
     let args = automatic(&folder, &format!("--out {}", out.display()));
     assert!(apply(&args).unwrap().exposure.unwrap().reason().contains("well lit"));
     let stored = Image::load(folder.join("a.png")).unwrap();

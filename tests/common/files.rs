@@ -43,6 +43,27 @@ pub(crate) fn copy(from: &Path, to: &Path) {
     }
 }
 
+/// The files of a folder, in order.
+pub(crate) fn paths(folder: &Path) -> Vec<PathBuf> {
+    let mut paths: Vec<PathBuf> =
+        fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    paths.sort();
+    paths
+}
+
+/// Every file below a folder, in order.
+pub(crate) fn files_below(folder: &Path) -> Vec<PathBuf> {
+    let inner = |path: PathBuf| if path.is_dir() { files_below(&path) } else { vec![path] };
+    paths(folder).into_iter().flat_map(inner).collect()
+}
+
+/// Every file below a folder, by its path there, and its bytes.
+pub(crate) fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let one =
+        |path: PathBuf| (path.strip_prefix(folder).unwrap().to_owned(), fs::read(&path).unwrap());
+    files_below(folder).into_iter().map(one).collect()
+}
+
 /// The text must contain all of these parts.
 #[track_caller]
 pub(crate) fn says(text: &str, parts: &[&str]) {

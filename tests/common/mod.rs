@@ -10,12 +10,15 @@ pub(crate) mod log;
 pub(crate) mod lpips;
 pub(crate) mod png;
 pub(crate) mod prelude;
+pub(crate) mod process;
 pub(crate) mod safetensors;
 pub(crate) mod setup;
 pub(crate) mod train;
 pub(crate) mod workspace;
 
-pub(crate) use files::{Folder, copy, fixture, not_run, says, shared};
+pub(crate) use files::{
+    Folder, contents, copy, files_below, fixture, not_run, paths, says, shared,
+};
 use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat_core::random::Stream;

@@ -10,24 +10,15 @@ pub(crate) mod photograph;
 mod picks;
 
 use ash::vk::Handle as _;
-use glam::{DAffine3, DVec2, DVec3, Vec3};
 use half::f16;
-use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{
-    Gpu, HostFrame, HostImage, ImageFormat, ImageState, Reference as _, Threads,
-};
+use nightsplat::gpu::{HostFrame, HostImage, ImageFormat, ImageState, Reference as _};
 use nightsplat::kernels::{depth_limits, pack_pixels, pixels};
 use nightsplat::reference::pack_pixels as pack_pixels_reference;
-use nightsplat::splats::device::{DeviceGaussians, Upload};
-use nightsplat::splats::render::{
-    DepthConvention, DepthKind, Purpose, RenderOptions, RenderSettings, Renderer, SceneDepth,
-    Target,
-};
-use nightsplat_core::camera::{Camera, CameraModel};
-use nightsplat_core::random::Stream;
-use nightsplat_models::gaussians::Gaussians;
+use nightsplat::splats::device::DeviceGaussians;
+use nightsplat::splats::render::{DepthConvention, DepthKind, Purpose, SceneDepth, Target};
 
-use crate::common::{Random, not_run};
+use crate::common::not_run;
+use crate::common::prelude::*;
 use crate::host::{Host, Picture, usual_extensions, with_host};
 use kernels::{random_word, words_of};
 

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::circles;
+use crate::common::files_below;
 
 pub(crate) const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
@@ -13,20 +14,8 @@ const MAX_LINES: usize = 600;
 
 /// The paths of all files below `folder`, relative to the repository.
 pub(crate) fn paths(folder: &str) -> Vec<PathBuf> {
-    let mut folders = vec![Path::new(ROOT).join(folder)];
-    let mut found = vec![];
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(&folder).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-            } else {
-                found.push(path.strip_prefix(ROOT).unwrap().to_owned());
-            }
-        }
-    }
-    found.sort();
-    found
+    let relative = |path: PathBuf| path.strip_prefix(ROOT).unwrap().to_owned();
+    files_below(&Path::new(ROOT).join(folder)).into_iter().map(relative).collect()
 }
 
 /// Every file below `folder` with the extension, with its text.

@@ -1,19 +1,16 @@
 //! The depth term.
 
-use glam::{UVec2, Vec2};
-use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{Gpu, Threads};
 use nightsplat::kernels::{
     DepthGradient, DepthMoments, depth_boxes, depth_correlation, depth_gradient, depth_moments,
 };
 use nightsplat::loss::{DepthBoxes, DepthLoss, LossTerm as _, Term};
-use nightsplat_core::random::Stream;
-use nightsplat_models::gaussians::Features;
 
 use super::{
     Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,
     log_step, noise, term_inputs, widen,
 };
+
+use crate::common::prelude::*;
 
 const FEATURES: Features = Features { depth: true, ..Features::NONE };
 

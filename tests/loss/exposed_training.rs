@@ -13,23 +13,22 @@ use crate::common::prelude::*;
 const FACTORS: [f32; 4] = [1.0, 0.5, 0.25, 2.0];
 
 /// Synthetic views, each darkened or brightened, under one curve.
-fn varied(folder: &Path) -> (TrainConfig, Dataset) {
-    let options = small_set(14, [40, 30], 3);
-    nightsplat_synth::write(folder, &options).unwrap();
+fn varied() -> (Folder, TrainConfig, Dataset) {
     let mut tone = ToneSettings::new(ToneCurve::Ase);
     tone.scene_statistics = true;
     let mut config = TrainConfig { steps: 300, sh_degree: 0, tone, ..TrainConfig::bare() };
     config.schedule.densify_before = 0;
     config.schedule.resolution_steps = [0, 40];
     config.exposure.learn = true;
-    let mut dataset = Dataset::load(folder, &config.load_options()).unwrap();
+    let folder = written(&small_set(14, [40, 30], 3));
+    let mut dataset = Dataset::load(&folder, &config.load_options()).unwrap();
     for (at, view) in dataset.views.iter_mut().filter(|view| view.is_train()).enumerate() {
         let image = view.image.as_mut().unwrap();
         for x in &mut image.data {
             *x = srgb_from_linear(FACTORS[at % 4] * linear_from_srgb(*x));
         }
     }
-    (config, dataset)
+    (folder, config, dataset)
 }
 
 fn l1_of_last_steps(config: &TrainConfig, dataset: &Dataset) -> f64 {
@@ -42,8 +41,7 @@ fn l1_of_last_steps(config: &TrainConfig, dataset: &Dataset) -> f64 {
 #[test]
 fn exposures_explain_photographs_that_differ_in_brightness_and_their_mean_is_exact_after_every_step()
  {
-    let folder = tempfile::tempdir().unwrap();
-    let (config, dataset) = varied(folder.path());
+    let (_folder, config, dataset) = varied();
     let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
     for step in [1, 2, 3, 50, 300] {
         advance(&mut trainer, step);
@@ -71,10 +69,9 @@ fn exposures_explain_photographs_that_differ_in_brightness_and_their_mean_is_exa
 
 #[test]
 fn exposures_that_are_off_leave_no_kernel_and_no_file() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut config, dataset) = varied(&folder.path().join("set"));
+    let (folder, mut config, dataset) = varied();
     config.steps = 2;
-    let out = folder.path().join("run");
+    let out = folder.join("run");
     for learn in [true, false] {
         config.exposure.learn = learn;
         let gpu = gpu();
@@ -106,13 +103,12 @@ fn exposures_that_are_off_leave_no_kernel_and_no_file() {
 
 #[test]
 fn a_run_with_exposures_is_resumed_bit_for_bit() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut config, dataset) = varied(folder.path());
+    let (folder, mut config, dataset) = varied();
     config.steps = 30;
     let gpu = gpu();
     let new = || Trainer::new(&gpu, config.clone(), &dataset).unwrap();
     let state = |trainer: &mut Trainer, name: &str| {
-        let path = folder.path().join(name);
+        let path = folder.join(name);
         trainer.save_checkpoint(&path).unwrap();
         fs::read(path).unwrap()
     };
@@ -122,25 +118,21 @@ fn a_run_with_exposures_is_resumed_bit_for_bit() {
     advance(&mut interrupted, 17);
     state(&mut interrupted, "checkpoint");
     let mut resumed = new();
-    resumed.restore(&folder.path().join("checkpoint")).unwrap();
+    resumed.restore(&folder.join("checkpoint")).unwrap();
     advance(&mut resumed, 30);
     assert!(state(&mut whole, "whole") == state(&mut resumed, "resumed"));
     assert_eq!(whole.exposures().unwrap(), resumed.exposures().unwrap());
     let mut off = config.clone();
     off.exposure.learn = false;
     let mut off = Trainer::new(&gpu, off, &dataset).unwrap();
-    let error = off.restore(&folder.path().join("checkpoint")).unwrap_err().to_string();
+    let error = off.restore(&folder.join("checkpoint")).unwrap_err().to_string();
     assert!(error.contains("exposure.learn"), "{error}");
 }
 
 #[test]
 fn a_denoiser_on_crops_sees_the_neutral_exposure_and_a_tonemapper_is_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut config, dataset) = varied(folder.path());
-    config.model.set_parts(&[Part::Denoiser, Part::Structure]);
-    config.model.network.channels = 4;
-    config.model.network.stages = 2;
-    config.model.network.repeats = 2;
+    let (_folder, mut config, dataset) = varied();
+    set_small_parts(&mut config, &[Part::Denoiser, Part::Structure]);
     config.model.denoiser_crop = 16;
     let gpu = gpu();
     let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
@@ -149,19 +141,18 @@ fn a_denoiser_on_crops_sees_the_neutral_exposure_and_a_tonemapper_is_refused() {
     checked.agree().unwrap();
     config.model.set_parts(&Part::ALL);
     let error = Trainer::new(&gpu, config, &dataset).unwrap_err().to_string();
-    assert!(error.contains("tonemapper") && error.contains("exposure.learn"), "{error}");
+    says(&error, &["tonemapper", "exposure.learn"]);
 }
 
 #[test]
 fn without_a_table_exposures_start_at_those_of_the_shared_points() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut config, dataset) = varied(folder.path());
+    let (folder, mut config, dataset) = varied();
     let begin = |config: &TrainConfig| -> Vec<Affine> {
         let trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
         trainer.exposures().unwrap().unwrap().into_iter().map(|(_, affine)| affine).collect()
     };
     let found = begin(&config);
-    let planted = folder.path().join("planted.csv");
+    let planted = folder.join("planted.csv");
     let lines = dataset.train_views().zip(FACTORS.iter().cycle());
     let line = |(view, factor): (&View, &f32)| format!("{},{}\n", view.name, factor.log2());
     fs::write(&planted, format!("name,ev\n{}", lines.map(line).collect::<String>())).unwrap();
@@ -176,8 +167,7 @@ fn without_a_table_exposures_start_at_those_of_the_shared_points() {
 /// The brightness of a held-out view says nothing about the model.
 #[test]
 fn a_held_out_view_scores_alike_at_any_exposure() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut config, mut dataset) = varied(folder.path());
+    let (_folder, mut config, mut dataset) = varied();
     let held_out = dataset.views.iter().position(View::is_train).unwrap();
     dataset.views[held_out].split = Split::HeldOut;
     let mut scores = vec![];
@@ -197,10 +187,9 @@ fn a_held_out_view_scores_alike_at_any_exposure() {
 
 #[test]
 fn a_table_sets_the_initial_exposures() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut config, dataset) = varied(folder.path());
+    let (folder, mut config, dataset) = varied();
     let names: Vec<&str> = dataset.train_views().map(|view| view.name.as_str()).collect();
-    let path = folder.path().join("known.csv");
+    let path = folder.join("known.csv");
     let begin = |config: &TrainConfig| {
         let trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
         let exposures = trainer.exposures().unwrap().unwrap();
@@ -214,7 +203,7 @@ fn a_table_sets_the_initial_exposures() {
     let of_stops = begin(&config);
     assert!(of_stops[2].stops() < of_stops[1].stops() && of_stops[1].stops() < of_stops[0].stops());
     // Next to the photographs, it is found.
-    fs::copy(&path, folder.path().join("exposures.csv")).unwrap();
+    fs::copy(&path, folder.join("exposures.csv")).unwrap();
     config.exposure.start = None;
     assert_eq!(begin(&config), of_stops);
 
@@ -232,5 +221,5 @@ fn a_table_sets_the_initial_exposures() {
 
     fs::write(&path, "name,ev\nnoone,1\nelsewhere,2\n").unwrap();
     let error = Trainer::new(&gpu(), config, &dataset).unwrap_err().to_string();
-    assert!(error.contains("noone, elsewhere") && error.contains("known.csv"), "{error}");
+    says(&error, &["noone, elsewhere", "known.csv"]);
 }

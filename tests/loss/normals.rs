@@ -1,18 +1,17 @@
 //! The term of normals.
 
-use glam::{UVec2, Vec2, Vec3};
-use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::map_normal::NO_NORMAL;
 use nightsplat::kernels::{Camera, normals, normals_backward};
 use nightsplat::loss::{LossTerm as _, NormalLoss, Term};
 use nightsplat::reference::normals::{map_normal, normal_loss, pixel_ray};
-use nightsplat_models::gaussians::Features;
 use nightsplat_photographs::dataset::NormalMap;
 
 use super::{
     Logged, NOT_FINITE, assert_close, assert_gradient, bits, central_differences, largest,
     log_step, noise, term_inputs, widen,
 };
+
+use crate::common::prelude::*;
 
 const SIZES: [[u32; 2]; 6] = [[1, 1], [3, 3], [2, 40], [7, 5], [33, 17], [64, 48]];
 const FOCAL: Vec2 = Vec2::new(50.0, 55.0);

@@ -1,26 +1,21 @@
 //! Runs compared, photographs left out, and sweeps over several datasets.
 
-use std::fs;
-
 use crate::common::command::{json, says};
 use crate::common::workspace::Workspace;
 
 #[test]
 fn runs_of_one_dataset_are_compared_and_runs_of_two_are_refused() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
     workspace.trained("a", "--steps 10");
     workspace.trained("b", "--steps 40");
-    let page = path("page.html");
-    let stdout = workspace.succeed(&format!("compare @a @b --report {page}"));
+    let stdout = workspace.succeed("compare @a @b --report @page.html");
     says(&stdout, &["PSNR of a, dB", "b gains", "steps: 10 | 40"]);
-    let html = fs::read_to_string(&page).unwrap();
+    let html = workspace.text("page.html");
     assert!(html.contains("Comparison of a, b") && html.contains("data:image/png"));
     let compared = json(workspace.succeed("compare @a @b --json"));
     let psnr = |index: usize| compared["runs"][index]["mean"]["psnr"].as_f64().unwrap();
     for (index, name) in ["a", "b"].into_iter().enumerate() {
-        let scores = workspace.succeed(&format!("eval @{name} --json"));
-        let scores = json(&scores);
+        let scores = json(workspace.succeed(&format!("eval @{name} --json")));
         assert!((psnr(index) - scores["mean"]["psnr"].as_f64().unwrap()).abs() < 1e-9, "{name}");
     }
     // Another size, and another dataset.
@@ -39,17 +34,12 @@ fn excluded_photographs_are_left_out_and_the_others_keep_their_split() {
     let train = |name: &str, options: &str| workspace.train(name, &format!("--steps 1 {options}"));
     workspace.succeed(&train("all", ""));
     workspace.succeed(&train("less", "--exclude 00[12] --exclude low/003.*"));
-    let names = |run: &str| fs::read_to_string(workspace.path(run).join("views.csv")).unwrap();
-    let gone: Vec<String> = names("all")
-        .lines()
-        .filter(|line| !names("less").contains(line))
-        .map(str::to_owned)
-        .collect();
-    assert_eq!(gone.len(), 3, "{gone:?}");
+    let names = |run: &str| workspace.text(&format!("{run}/views.csv"));
+    let (all, less) = (names("all"), names("less"));
+    assert_eq!(all.lines().filter(|line| !less.contains(line)).count(), 3, "{less}");
     workspace.write("names.txt", "# blurred\n001.png\n\n");
     workspace.succeed(&train("listed", "--exclude-file @names.txt"));
-    let config = workspace.text("listed/config.toml");
-    assert!(config.contains("exclude = [\"001.png\"]"), "{config}");
+    says(&workspace.text("listed/config.toml"), &["exclude = [\"001.png\"]"]);
     workspace.refused(&train("no", "--exclude IMG_*"), 3, &[&set, "`IMG_*`"]);
     workspace.refused(&train("no", "--exclude [a"), 2, &["exclude"]);
     workspace.refused(&train("no", "--exclude *"), 3, &["no photograph is left"]);
@@ -58,7 +48,6 @@ fn excluded_photographs_are_left_out_and_the_others_keep_their_split() {
 #[test]
 fn a_sweep_over_two_datasets_writes_the_table_that_papers_print() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
     workspace.succeed("synth @other --views 9 --width 32 --height 24");
     let sweep =
         "sweep @set @other --out @sweep --curves ap3,ase --seeds 1,2 --steps 2 --sh-degree 0";
@@ -75,21 +64,17 @@ fn a_sweep_over_two_datasets_writes_the_table_that_papers_print() {
     assert!(first >= second && means[0].starts_with("**"), "{table}");
     assert_eq!(table.matches(" ± ").count(), 8, "{table}");
     let page = workspace.text("sweep/index.html");
-    assert!(page.contains("<h1>Sweep sweep</h1>") && page.contains("class=\"best\""), "{page}");
+    says(&page, &["<h1>Sweep sweep</h1>", "class=\"best\""]);
     for scene in ["set", "other"] {
         assert!(page.contains(&format!("<a href=\"{scene}/index.html\">{scene}: ")), "{page}");
     }
-    let of_scene = workspace.text("sweep/set/index.html");
-    assert!(of_scene.contains("<h1>Sweep of set</h1>"), "{of_scene}");
+    says(&workspace.text("sweep/set/index.html"), &["<h1>Sweep of set</h1>"]);
     let csv = workspace.text("sweep/scenes.csv");
     assert_eq!(csv.lines().count(), 7, "{csv}");
-    assert!(
-        workspace.path("sweep/set/index.html").exists()
-            && workspace.path("sweep/scenes.tex").exists()
-    );
+    assert!(workspace.path("sweep/scenes.tex").exists());
     // Repeated, it trains nothing again.
     let (_, message) = workspace.run(sweep, 0);
     assert!(!message.contains("finished"), "{message}");
-    let twice = format!("sweep {0} {0} --out {1} --curves ap3", path("set"), path("twice"));
-    workspace.refused(&twice, 2, &["two datasets are named set"]);
+    let twice = "sweep @set @set --out @twice --curves ap3";
+    workspace.refused(twice, 2, &["two datasets are named set"]);
 }

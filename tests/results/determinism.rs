@@ -7,7 +7,6 @@ use std::thread::JoinHandle;
 
 use nightsplat::train::Background;
 
-use crate::common::command::succeed;
 use crate::common::prelude::*;
 use crate::common::train::dataset;
 use crate::common::{fixture, not_run};
@@ -124,22 +123,19 @@ fn keep_first_points(path: &Path, count: usize) {
     fs::write(path, kept.map(|line| format!("{line}\n")).collect::<String>()).unwrap();
 }
 
-/// A tiny scene, trained with density control, in a folder with `hashes.csv`, `train.csv` and `metrics.json`.
-fn tiny_run() -> (tempfile::TempDir, PathBuf) {
-    let folder = tempfile::tempdir().unwrap();
-    let [set, run] = ["set", "run"].map(|name| folder.path().join(name));
-    let options = small_set(8, [32, 24], 1);
-    nightsplat_synth::write(&set, &options).unwrap();
-    keep_first_points(&set.join("colmap_sparse/0/points3D.txt"), 2000);
-    succeed(&format!(
-        "train {} --out {} --plan none --model plain --curve ap3 --steps 60 --hash-every 20 --set tile=[16,8] \
+/// A tiny scene, trained with density control, in a folder whose `run` has `hashes.csv`, `train.csv` and
+/// `metrics.json`.
+fn tiny_run() -> Folder {
+    let folder = Folder::empty();
+    nightsplat_synth::write(folder.join("set"), &small_set(8, [32, 24], 1)).unwrap();
+    keep_first_points(&folder.join("set/colmap_sparse/0/points3D.txt"), 2000);
+    folder.succeed(
+        "train @set --out @run --plan none --model plain --curve ap3 --steps 60 --hash-every 20 --set tile=[16,8] \
          --set schedule.densify_after=10 --set schedule.densify_interval=10 --max-gaussians 2000 --background black \
          --set density.depth_seeding=0 --set precision.rest=32 --set precision.moments=32 \
          --set schedule.cooldown_steps=0",
-        set.display(),
-        run.display()
-    ));
-    (folder, run)
+    );
+    folder
 }
 
 #[test]
@@ -151,8 +147,7 @@ fn a_tiny_scene_trains_to_the_ledger_of_this_driver() {
         not_run("ledger", format_args!("this driver has none, tests/fixtures/ledger/{name}"));
         return;
     };
-    let (_folder, run) = tiny_run();
-    let actual = fs::read_to_string(run.join("hashes.csv")).unwrap();
+    let actual = tiny_run().text("run/hashes.csv");
     assert_eq!(actual, expected, "where this is meant, it belongs into {}", ledger.display());
 }
 
@@ -163,7 +158,7 @@ fn every_device_trains_a_tiny_scene_to_the_same_losses_and_score() {
     const FIRST: f64 = 1e-5;
     const LOSS: f64 = 5e-3;
     const SCORE: f64 = 0.05;
-    let (_folder, run) = tiny_run();
+    let folder = tiny_run();
     let losses = |path: PathBuf| -> Vec<f64> {
         let text = fs::read_to_string(path).unwrap();
         let column = text.lines().next().unwrap().split(',').position(|name| name == "loss");
@@ -171,14 +166,12 @@ fn every_device_trains_a_tiny_scene_to_the_same_losses_and_score() {
         text.lines().skip(1).map(loss).collect()
     };
     let expected = losses(fixture("devices/losses.csv"));
-    let actual = losses(run.join("train.csv"));
+    let actual = losses(folder.join("run/train.csv"));
     assert_eq!(actual.len(), expected.len());
     for (step, (actual, expected)) in (1..).zip(actual.into_iter().zip(expected)) {
         let bound = if step == 1 { FIRST } else { LOSS };
         assert!((actual / expected - 1.0).abs() <= bound, "step {step}: {actual}, not {expected}");
     }
-    let text = fs::read_to_string(run.join("metrics.json")).unwrap();
-    let metrics: Value = serde_json::from_str(&text).unwrap();
-    let psnr = metrics["mean"]["psnr"].as_f64().unwrap();
+    let psnr = folder.json("run/metrics.json")["mean"]["psnr"].as_f64().unwrap();
     assert!((psnr - 23.844).abs() <= SCORE, "{psnr} dB");
 }

@@ -2,7 +2,6 @@
 
 use nightsplat::splats::model::Model;
 
-use crate::common::command::{json, says};
 use crate::common::largest;
 use crate::common::prelude::*;
 
@@ -118,7 +117,6 @@ fn a_crop_keeps_what_is_inside_and_a_merge_puts_both_halves_together() {
 #[test]
 fn an_edit_list_repeats_an_edit_of_its_model_and_is_refused_for_another() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
     cloud(200, 7).save(workspace.path("a.ply")).unwrap();
     cloud(100, 8).save(workspace.path("b.ply")).unwrap();
     let options = "--crop 0,0,0,1.2 --rotate 1,1,0:37 --scale 0,0,0:0,2,0=3 --move 1,0,0 --merge";
@@ -140,47 +138,43 @@ fn an_edit_list_repeats_an_edit_of_its_model_and_is_refused_for_another() {
     let lists: Vec<&str> =
         header.lines().filter(|line| line.starts_with("comment edits: {")).collect();
     assert!(lists.len() == 2 && lists[0].contains("crop") && lists[1].contains("move"), "{header}");
-    assert!(!header.contains(&path("b.ply")) && lists[0].contains(r#""file":"b.ply""#), "{header}");
+    assert!(
+        !header.contains(&workspace.named("@b.ply")) && lists[0].contains(r#""file":"b.ply""#),
+        "{header}"
+    );
 
-    let list = path("edits.json");
-    let other = format!("edit @b.ply --edits {list} --out @out.ply");
-    workspace.refused(&other, 3, &["edits.json", "another model", "b.ply is"]);
+    let other = "edit @b.ply --edits @edits.json --out @out.ply";
+    workspace.refused(other, 3, &["edits.json", "another model", "b.ply is"]);
     // A merged model that changed since.
     cloud(100, 9).save(workspace.path("b.ply")).unwrap();
-    let changed = format!("edit @a.ply --edits {list} --out @out.ply");
-    workspace.refused(&changed, 3, &["b.ply", "as the edit list says"]);
+    let changed = "edit @a.ply --edits @edits.json --out @out.ply";
+    workspace.refused(changed, 3, &["b.ply", "as the edit list says"]);
     workspace.write("edits.json", text.replace("edits\": 1", "edits\": 9"));
-    workspace.refused(&changed, 3, &["edits.json", "of version 9"]);
+    workspace.refused(changed, 3, &["edits.json", "of version 9"]);
     assert!(!workspace.path("out.ply").exists());
 }
 
 #[test]
 fn an_edit_that_leaves_nothing_or_cannot_be_written_says_so_and_writes_nothing() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
     cloud(20, 7).save(workspace.path("a.ply")).unwrap();
-    let out = path("out.ply");
-    let (model, set) = (path("a.ply"), path("set"));
     for (options, code, part) in [
-        ("--crop 50,0,0,1".to_owned(), 2, "leaves none of 20 Gaussians"),
-        ("--opacity-min 0.99".to_owned(), 2, "opacity-min leaves none of 20"),
-        ("--scale 0".to_owned(), 2, "a scale of 0 is none"),
-        ("--scale nan".to_owned(), 2, "a scale of NaN is none"),
-        ("--crop nan,0,0,1".to_owned(), 2, "is not a finite number"),
-        ("--merge nowhere.ply".to_owned(), 3, "nowhere.ply"),
-        ("--crop cameras".to_owned(), 3, "--dataset"),
-        ("--floaters".to_owned(), 3, "--dataset"),
-        (format!("--scale {set}/transforms_train.json --dataset {set}"), 3, "line 2 is not a name"),
-        (String::new(), 2, "no operation is given"),
+        ("--crop 50,0,0,1", 2, "leaves none of 20 Gaussians"),
+        ("--opacity-min 0.99", 2, "opacity-min leaves none of 20"),
+        ("--scale 0", 2, "a scale of 0 is none"),
+        ("--scale nan", 2, "a scale of NaN is none"),
+        ("--crop nan,0,0,1", 2, "is not a finite number"),
+        ("--merge nowhere.ply", 3, "nowhere.ply"),
+        ("--crop cameras", 3, "--dataset"),
+        ("--floaters", 3, "--dataset"),
+        ("--scale @set/transforms_train.json --dataset @set", 3, "line 2 is not a name"),
+        ("", 2, "no operation is given"),
     ] {
-        workspace.refused(&format!("edit {model} {options} --out {out}"), code, &[part]);
+        workspace.refused(&format!("edit @a.ply {options} --out @out.ply"), code, &[part]);
     }
-    workspace.refused(
-        &format!("edit {model} --move 1,0,0 --out {model}"),
-        1,
-        &["is the model itself"],
-    );
-    workspace.refused(&format!("edit {model} --move 1,0,0 --out {out}.txt"), 2, &["name it .ply"]);
+    let moved = "edit @a.ply --move 1,0,0 --out";
+    workspace.refused(&format!("{moved} @a.ply"), 1, &["is the model itself"]);
+    workspace.refused(&format!("{moved} @out.ply.txt"), 2, &["name it .ply"]);
     let mut broken = workspace.read("a.ply");
     let length = broken.len();
     broken[length - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
@@ -188,21 +182,18 @@ fn an_edit_that_leaves_nothing_or_cannot_be_written_says_so_and_writes_nothing()
     let left = fs::read_dir(workspace.path("")).unwrap().count();
     // The set and the two models.
     assert_eq!(left, 3);
-    let out = path("new/folder/out.ply");
-    let (_, message) = workspace.run(&format!("edit @nan.ply --move 1,0,0 --out {out}"), 0);
-    assert!(message.contains("1 of 20 Gaussians have an infinity or NaN"), "{message}");
+    let out = workspace.path("new/folder/out.ply");
+    let move_to = "edit @nan.ply --move 1,0,0 --out @new/folder/out.ply";
+    says(&workspace.run(move_to, 0).1, &["1 of 20 Gaussians have an infinity or NaN"]);
     assert_eq!(Gaussians::open(out).unwrap().count, 19);
 }
 
 #[test]
 fn a_table_of_cameras_in_metres_scales_a_model_and_cameras_crop_it_wherever_it_is() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
     workspace.trained("run", "--steps 10");
-    let set = path("set");
     // 2.5 metres a unit, in a world of another origin.
-    let listing = workspace.text("set/transforms_train.json");
-    let listing = json(&listing);
+    let listing = workspace.json("set/transforms_train.json");
     let row = |frame: &Value| {
         let at = |row: usize| 2.5 * frame["transform_matrix"][row][3].as_f64().unwrap() + 100.0;
         let name = frame["file_path"].as_str().unwrap().rsplit('/').next().unwrap();
@@ -231,7 +222,7 @@ fn a_table_of_cameras_in_metres_scales_a_model_and_cameras_crop_it_wherever_it_i
     let [cropped, moved] =
         ["cropped.ply", "moved.ply"].map(|name| ply::load(workspace.path(name)).unwrap());
     assert!(cropped.count > 0 && cropped.count <= trained.count);
-    assert_eq!(cropped.count, moved.count, "{set}");
+    assert_eq!(cropped.count, moved.count);
 }
 
 #[test]

@@ -1,12 +1,9 @@
 //! `nightsplat export` as a shell runs it. The formats are tested next to their encoders.
 
-use std::path::Path;
-
 use nightsplat::glam::Vec3;
-use nightsplat_core::random::Stream;
-use nightsplat_models::gaussians::{Gaussians, ply};
 
 use crate::common::command::{Folder, json, says};
+use crate::common::prelude::*;
 
 /// A folder with a short run on a small synthetic dataset.
 fn trained() -> Folder {
@@ -33,7 +30,7 @@ fn every_format_is_one_file_of_the_run_with_its_expected_beginning() {
     says(&folder.text("run/model.html"), &parts);
 
     // Without reference images the targets are what the model is compared with.
-    std::fs::remove_dir_all(folder.path("set/high")).unwrap();
+    fs::remove_dir_all(folder.path("set/high")).unwrap();
     folder.succeed("export @run --format html");
     let html = folder.text("run/model.html");
     let labels = ["photograph", "target", "reference"]
@@ -65,7 +62,7 @@ fn a_page_of_limited_size_rounds_coefficients_before_it_leaves_them_out() {
     let mut exported = |most: u64| {
         let line =
             folder.succeed(&format!("export @run --format html --views 1 --max-size {most}B"));
-        sizes.push(std::fs::metadata(folder.path("run/model.html")).unwrap().len());
+        sizes.push(fs::metadata(folder.path("run/model.html")).unwrap().len());
         (line, *sizes.last().unwrap())
     };
     let (line, whole) = exported(1 << 30);
@@ -81,7 +78,7 @@ fn a_page_of_limited_size_rounds_coefficients_before_it_leaves_them_out() {
 
 /// Positions in a GLB, which come first.
 fn positions_of_glb(path: &Path) -> Vec<[f32; 3]> {
-    let file = std::fs::read(path).unwrap();
+    let file = fs::read(path).unwrap();
     let word = |at: usize| u32::from_le_bytes(file[at..at + 4].try_into().unwrap()) as usize;
     let text = word(12);
     let json = json(&file[20..20 + text]);
@@ -126,6 +123,6 @@ fn a_failed_export_is_one_line_and_leaves_no_file() {
         folder.refused("export @run --format glb --out @full.glb", 1, &["full.glb", "disk"]);
         assert!(!folder.path("full.glb.partial").exists());
     }
-    std::fs::remove_file(folder.path("run/model.ply")).unwrap();
+    fs::remove_file(folder.path("run/model.ply")).unwrap();
     folder.refused("export @run --format spz", 3, &["no model.ply"]);
 }

@@ -1,34 +1,9 @@
 //! Failures around a run: lost devices, full disks, deleted folders. Each has a defined outcome.
 #![cfg(unix)]
 
-use std::io::{BufRead, BufReader};
-use std::process::Child;
-
 use crate::common::command::{command, refused_with, run, succeed};
 use crate::common::prelude::*;
-
-/// A running command in its own process group, as a shell would start it.
-fn begun(arguments: &str) -> Child {
-    command(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
-}
-
-/// Waits for the first line of JSON, which marks the start of a training.
-fn wait_for_start(child: &mut Child) {
-    let mut line = String::new();
-    BufReader::new(child.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
-    assert!(line.contains("started") && line.contains("peak_device"), "{line}");
-}
-
-fn terminate(child: &Child) {
-    let pid = child.id().to_string();
-    assert!(Command::new("kill").args(["-TERM", &pid]).status().unwrap().success());
-}
-
-/// Exit code and standard error.
-fn ended(child: Child) -> (i32, String) {
-    let output = child.wait_with_output().unwrap();
-    (output.status.code().unwrap_or(-1), String::from_utf8(output.stderr).unwrap())
-}
+use crate::common::process::{ended, ends, send, spawned, started};
 
 #[test]
 fn a_lost_device_and_a_lack_of_memory_exit_with_4_and_the_run_can_be_resumed() {
@@ -67,7 +42,7 @@ fn a_full_disk_is_reported_and_existing_files_stay_intact() {
         Command::new("sh").args(["-c", &line]).env("NIGHTSPLAT_TUNE", "off").output().unwrap();
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{stderr}");
-    assert!(stderr.contains("cannot be written") && stderr.contains("disk"), "{stderr}");
+    says(&stderr, &["cannot be written", "disk"]);
     let is_half = |name: &str| name.ends_with(".partial") || name.starts_with(".tmp");
     let files: Vec<_> = fs::read_dir(workspace.path("run")).unwrap().flatten().collect();
     let names = files.iter().map(|file| file.file_name().to_string_lossy().into_owned());
@@ -87,8 +62,7 @@ fn an_unwritable_directory_is_refused_before_training() {
         .train("run", "--steps 1")
         .replace(&workspace.path("run").display().to_string(), "/proc/nightsplat");
     let begin = Instant::now();
-    let (_, stderr) = run(&read_only, 1);
-    assert!(stderr.contains("/proc/nightsplat"), "{stderr}");
+    says(&run(&read_only, 1).1, &["/proc/nightsplat"]);
     assert!(begin.elapsed() < Duration::from_secs(60));
 }
 
@@ -96,21 +70,19 @@ fn an_unwritable_directory_is_refused_before_training() {
 fn a_deleted_run_folder_is_reported_and_a_run_without_its_photographs_is_saved() {
     let workspace = Workspace::new();
     let endless = "--steps 1000000 --checkpoint-every 0 --progress json";
-    let mut child = begun(&workspace.train("gone", endless));
-    wait_for_start(&mut child);
+    let child = started(&mut command(&workspace.train("gone", endless)));
     fs::remove_dir_all(workspace.path("gone")).unwrap();
-    terminate(&child);
-    let (code, stderr) = ended(child);
-    assert!(code == 1 && stderr.contains("gone"), "{code}: {stderr}");
+    send("-TERM", child.id());
+    ends(child, 1, &["gone"]);
 
     // An empty cache: every photograph is on disk, as at the start of the run.
     let options = "--steps 300 --cache 1K --checkpoint-every 0";
     workspace.trained("straight", options);
-    let mut child = begun(&workspace.train("run", &format!("{options} --progress json")));
-    wait_for_start(&mut child);
+    let train = workspace.train("run", &format!("{options} --progress json"));
+    let mut child = started(&mut command(&train));
     fs::rename(workspace.path("set"), workspace.path("elsewhere")).unwrap();
     let _ = child.stdout.take();
-    let (code, stderr) = ended(child);
+    let (code, _, stderr) = ended(child);
     if code != 0 {
         assert!(code == 3 && stderr.contains("set"), "{code}: {stderr}");
         assert!(workspace.path("run/checkpoint.safetensors").exists(), "{stderr}");
@@ -126,25 +98,21 @@ fn a_terminated_batch_saves_its_runs_and_resumes_to_the_same_leaderboard() {
     // A GPU must not be done before the log of its first steps is seen, which is written twice a second.
     let steps = if gpu().properties().is_cpu { 400 } else { 10_000 };
     let sweep = |name: &str| {
-        let (set, out) = (workspace.path("set"), workspace.path(name));
-        let (set, out) = (set.display(), out.display());
-        format!("sweep {set} --out {out} --curves linear,ase --steps {steps} --sh-degree 1")
+        let options = format!("--curves linear,ase --steps {steps} --sh-degree 1");
+        workspace.named(&format!("sweep @set --out @{name} {options}"))
     };
-    let child = begun(&sweep("sweep"));
+    let child = spawned(&mut command(&sweep("sweep")));
     let first = workspace.path("sweep/curve=linear/train.csv");
     let begin = Instant::now();
     while fs::read_to_string(&first).map_or(0, |log| log.lines().count()) < 3 {
         assert!(begin.elapsed() < Duration::from_secs(120));
         std::thread::sleep(Duration::from_millis(10));
     }
-    terminate(&child);
-    let (code, stderr) = ended(child);
-    assert_eq!(code, 143, "{stderr}");
-    assert!(stderr.contains("stopped with 0 of 2 runs done (terminated)"), "{stderr}");
+    send("-TERM", child.id());
+    ends(child, 143, &["stopped with 0 of 2 runs done (terminated)"]);
     assert!(workspace.path("sweep/curve=linear/checkpoint.safetensors").exists());
     assert!(!workspace.path("sweep/curve=ase/config.toml").exists());
     succeed(&sweep("sweep"));
     succeed(&sweep("straight"));
-    let leaderboard = |name: &str| fs::read(workspace.path(name).join("leaderboard.csv")).unwrap();
-    assert!(leaderboard("sweep") == leaderboard("straight"));
+    assert!(workspace.read("sweep/leaderboard.csv") == workspace.read("straight/leaderboard.csv"));
 }

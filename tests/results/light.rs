@@ -4,6 +4,7 @@ use nightsplat::splats::model::Model;
 
 use crate::common::command::{json, says, unwrapped};
 use crate::common::prelude::*;
+use crate::common::{copy, paths};
 
 /// The arguments for training with the default curve into `run`.
 fn training(options: &str) -> String {
@@ -33,7 +34,7 @@ fn renders_are_written_and_scored_in_the_light_of_the_photographs() {
 
     let render = |out: &str, options: &str| {
         workspace.succeed(&format!("render @run --split test --out @{out} {options}"));
-        let file = fs::read_dir(workspace.path(out)).unwrap().next().unwrap().unwrap().path();
+        let file = paths(&workspace.path(out)).remove(0);
         (fs::read(&file).unwrap(), Image::load(&file).unwrap())
     };
     let mean = |image: &Image| image.data.iter().sum::<f32>() / image.data.len() as f32;
@@ -146,11 +147,6 @@ fn a_set_of_varying_exposure_has_its_clean_references_and_the_same_bytes_for_a_s
 #[test]
 fn varied_exposures_of_a_dark_set_are_warned_of() {
     let workspace = Workspace::new();
-    let set = workspace.path("set");
-    for photograph in fs::read_dir(set.join("low")).unwrap() {
-        let photograph = photograph.unwrap();
-        fs::copy(photograph.path(), set.join("high").join(photograph.file_name())).unwrap();
-    }
-    let (_, warned) = workspace.run("vary @set --out @out", 0);
-    assert!(warned.contains("photographs are dark"), "{warned}");
+    copy(&workspace.path("set/low"), &workspace.path("set/high"));
+    says(&workspace.run("vary @set --out @out", 0).1, &["photographs are dark"]);
 }

@@ -2,7 +2,6 @@
 #![cfg(unix)]
 
 use std::fs::File;
-use std::io::{BufRead, BufReader};
 use std::process::Child;
 use std::time::SystemTime;
 
@@ -10,38 +9,14 @@ use nightsplat::gpu::testing::not_run;
 
 use crate::common::command::{command, refused, run, says, succeed};
 use crate::common::prelude::*;
+use crate::common::process::{ended, ends, send, started, wait_for};
 use crate::common::workspace::log;
+
+const ENDLESS: &str = "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0";
 
 /// A training that has started and has thousands of steps to go.
 fn begun(arguments: &str) -> Child {
     started(&mut command(&format!("{arguments} --progress json")))
-}
-
-fn started(command: &mut Command) -> Child {
-    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    let mut line = String::new();
-    BufReader::new(child.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
-    assert!(line.contains("started"), "{line}");
-    child
-}
-
-fn send(signal: &str, child: &Child) {
-    let pid = child.id().to_string();
-    assert!(Command::new("kill").args([signal, &pid]).status().unwrap().success());
-}
-
-/// Exit code and standard error.
-fn ended(child: Child) -> (i32, String) {
-    let output = child.wait_with_output().unwrap();
-    (output.status.code().unwrap_or(-1), String::from_utf8(output.stderr).unwrap())
-}
-
-fn wait_for(path: &Path) {
-    let begin = Instant::now();
-    while !path.exists() {
-        assert!(begin.elapsed() < Duration::from_secs(120), "{} does not come", path.display());
-        std::thread::sleep(Duration::from_millis(10));
-    }
 }
 
 #[test]
@@ -51,27 +26,17 @@ fn a_signal_saves_and_stops_and_the_run_resumes_to_the_same_bits() {
     for (signal, code, message) in [("-INT", 130, "interrupted"), ("-TERM", 143, "terminated")] {
         let name = format!("stopped{signal}");
         let mut child = begun(&workspace.train(&name, "--steps 400"));
-        send(signal, &child);
+        send(signal, child.id());
         let _ = child.stdout.take();
-        let (status, stderr) = ended(child);
-        assert_eq!(status, code, "{stderr}");
+        let saved = ", saved; go on with `nightsplat train ";
+        let parts = ["stopped after step ", message, saved, " --resume --finish`"];
+        let stderr = ends(child, code, &parts);
         assert!(!stderr.contains("error"), "stopping is none: {stderr}");
-        let parts = [
-            "stopped after step ",
-            message,
-            ", saved; go on with `nightsplat train ",
-            " --resume --finish`",
-        ];
-        assert!(parts.iter().all(|part| stderr.contains(part)), "{stderr}");
-        assert!(
-            !workspace.path(&name).join("metrics.json").exists(),
-            "the run ended before the signal"
-        );
+        let metrics = workspace.path(&name).join("metrics.json");
+        assert!(!metrics.exists(), "the run ended before the signal");
         assert!(!workspace.path(&name).join(".lock").exists());
         workspace.trained(&name, "--steps 400 --resume");
-        assert!(
-            workspace.read(&format!("{name}/model.ply")) == workspace.read("straight/model.ply")
-        );
+        assert!(workspace.model(&name) == workspace.model("straight"));
         assert_eq!(log(&workspace.path(&name)), log(&workspace.path("straight")));
     }
 }
@@ -79,30 +44,25 @@ fn a_signal_saves_and_stops_and_the_run_resumes_to_the_same_bits() {
 #[test]
 fn a_run_saves_on_request_and_when_its_checkpoint_is_old_and_continues() {
     let workspace = Workspace::new();
-    let child = begun(
-        &workspace.train("asked", "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0"),
-    );
+    let child = begun(&workspace.train("asked", ENDLESS));
     let checkpoint = workspace.path("asked/checkpoint.safetensors");
     assert!(!checkpoint.exists());
-    send("-USR1", &child);
+    send("-USR1", child.id());
     wait_for(&checkpoint);
     // A second run in the directory is refused, and the process of the first named.
     let holder = format!("process {}", child.id());
     for held in ["", "--resume", "--overwrite"] {
         refused(&workspace.train("asked", held), 1, &["asked", &holder]);
     }
-    send("-KILL", &child);
+    send("-KILL", child.id());
     ended(child);
 
-    let child = begun(
-        &workspace.train("old", "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0.01"),
-    );
+    let child = begun(&workspace.train("old", &format!("{ENDLESS}.01")));
     wait_for(&workspace.path("old/checkpoint.before.safetensors"));
     // From a terminal, and from a parent that forwards it.
-    send("-INT", &child);
-    send("-INT", &child);
-    let (code, stderr) = ended(child);
-    assert!(code == 130 && stderr.contains(", saved;"), "{code}: {stderr}");
+    send("-INT", child.id());
+    send("-INT", child.id());
+    ends(child, 130, &[", saved;"]);
 }
 
 #[test]
@@ -110,27 +70,25 @@ fn a_run_that_is_to_finish_cools_down_and_is_complete_also_if_it_is_stopped_mean
     let workspace = Workspace::new();
     refused(&workspace.train("absent", "--resume --finish"), 3, &["absent", "no checkpoint"]);
     refused(&workspace.train("absent", "--finish"), 2, &["--resume"]);
-    let endless = "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0";
-    let child = begun(&workspace.train("asked", endless));
-    send("-USR2", &child);
-    let (code, stderr) = ended(child);
-    assert_eq!(code, 0, "{stderr}");
+    let child = begun(&workspace.train("asked", ENDLESS));
+    send("-USR2", child.id());
+    ends(child, 0, &[]);
     let metrics = workspace.json("asked/metrics.json");
     assert_eq!(metrics["ended"]["reason"], "requested");
     assert!(metrics["steps"].as_u64().unwrap() < 900_000, "{}", metrics["steps"]);
-    assert!(workspace.trained("asked", &format!("{endless} --resume")).contains("is done"));
+    assert!(workspace.trained("asked", &format!("{ENDLESS} --resume")).contains("is done"));
 
     let steps = "--steps 900 --hash-every 40";
     let child = begun(&workspace.train("stopped", steps));
-    send("-INT", &child);
-    assert_eq!(ended(child).0, 130);
+    send("-INT", child.id());
+    ends(child, 130, &[]);
     crate::common::copy(&workspace.path("stopped"), &workspace.path("again"));
     let told = workspace.trained("stopped", &format!("{steps} --resume --finish"));
     assert!(told.contains("its end was requested"), "{told}");
     // The request is recorded at its first step.
     let stops = format!("{steps} --resume --max-minutes 0.000001");
     let first = run(&workspace.train("again", &format!("{stops} --finish")), 75).1;
-    assert!(first.contains("stopped after step") && first.contains("its time was up"), "{first}");
+    says(&first, &["stopped after step", "its time was up"]);
     while command(&workspace.train("again", &stops)).output().unwrap().status.code() == Some(75) {}
     assert!(workspace.model("again") == workspace.model("stopped"));
     assert_eq!(log(&workspace.path("again")), log(&workspace.path("stopped")));
@@ -143,36 +101,31 @@ fn a_closed_terminal_saves_and_stops_unless_the_run_was_started_to_outlive_it() 
         return not_run("terminal", "the tests were started to outlive theirs, as by nohup");
     }
     let workspace = Workspace::new();
-    let endless = "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0";
-    let child = begun(&workspace.train("closed", endless));
-    send("-HUP", &child);
-    let (code, stderr) = ended(child);
-    assert!(code == 129 && stderr.contains("(hung up), saved"), "{code}: {stderr}");
+    let child = begun(&workspace.train("closed", ENDLESS));
+    send("-HUP", child.id());
+    ends(child, 129, &["(hung up), saved"]);
     assert!(workspace.path("closed/checkpoint.safetensors").exists());
 
     // As `nohup` starts it.
-    let train = workspace.train("outlives", &format!("{endless} --progress json"));
+    let train = workspace.train("outlives", &format!("{ENDLESS} --progress json"));
     let (program, line) = (command("").get_program().to_owned(), "trap '' HUP; exec \"$@\"");
     let mut shell = Command::new("sh");
     shell.args(["-c", line, "sh"]).arg(program).args(train.split_whitespace());
     let mut child = started(&mut shell);
-    send("-HUP", &child);
-    send("-USR1", &child);
+    send("-HUP", child.id());
+    send("-USR1", child.id());
     wait_for(&workspace.path("outlives/checkpoint.safetensors"));
     assert!(child.try_wait().unwrap().is_none(), "it is gone");
-    send("-INT", &child);
-    let (code, stderr) = ended(child);
-    assert!(code == 130 && stderr.contains(", saved;"), "{code}: {stderr}");
+    send("-INT", child.id());
+    ends(child, 130, &[", saved;"]);
 }
 
 #[test]
 fn a_run_out_of_processor_time_saves_and_asks_to_be_repeated() {
     let workspace = Workspace::new();
-    let endless = "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0";
-    let child = begun(&workspace.train("run", endless));
-    send("-XCPU", &child);
-    let (code, stderr) = ended(child);
-    assert!(code == 75 && stderr.contains("(its time was up), saved"), "{code}: {stderr}");
+    let child = begun(&workspace.train("run", ENDLESS));
+    send("-XCPU", child.id());
+    ends(child, 75, &["(its time was up), saved"]);
     assert!(workspace.path("run/checkpoint.safetensors").exists());
 }
 
@@ -197,7 +150,7 @@ fn a_run_whose_time_is_up_asks_to_be_repeated_and_a_finished_one_does_not() {
     }
     assert!(rounds >= 2, "{rounds}");
     workspace.trained("straight", "--steps 120");
-    assert!(workspace.read("run/model.ply") == workspace.read("straight/model.ply"));
+    assert!(workspace.model("run") == workspace.model("straight"));
     // Repeated: nothing is done, and no file changes.
     let modified = || fs::metadata(workspace.path("run/model.ply")).unwrap().modified().unwrap();
     let before = modified();
@@ -211,12 +164,12 @@ fn a_run_whose_time_is_up_asks_to_be_repeated_and_a_finished_one_does_not() {
 fn a_finished_run_is_kept_until_its_replacement_has_done_a_step() {
     let workspace = Workspace::new();
     workspace.trained("run", "--steps 3");
-    let before = workspace.read("run/model.ply");
+    let before = workspace.model("run");
     // A network too large for any device: the run fails after all earlier checks.
     let hopeless = "--overwrite --steps 3 --parts denoiser --denoiser-channels 16384";
     let output = command(&workspace.train("run", hopeless)).output().unwrap();
     assert_ne!(output.status.code(), Some(0));
-    assert!(workspace.read("run/model.ply") == before && !workspace.path("run/.replaced").exists());
+    assert!(workspace.model("run") == before && !workspace.path("run/.replaced").exists());
     // Killed before the first step: the next start restores it.
     fs::create_dir(workspace.path("run/.replaced")).unwrap();
     for name in ["model.ply", "config.toml", "metrics.json", "train.csv"] {
@@ -230,11 +183,9 @@ fn a_finished_run_is_kept_until_its_replacement_has_done_a_step() {
         1,
         &["already contains a run", "--overwrite"],
     );
-    assert!(
-        workspace.read("run/model.ply") == before && !workspace.path("run/.tmpA1b2C3").exists()
-    );
+    assert!(workspace.model("run") == before && !workspace.path("run/.tmpA1b2C3").exists());
     workspace.trained("run", "--steps 4 --overwrite");
-    assert!(workspace.read("run/model.ply") != before && !workspace.path("run/.replaced").exists());
+    assert!(workspace.model("run") != before && !workspace.path("run/.replaced").exists());
 }
 
 #[test]
@@ -256,7 +207,7 @@ fn a_damaged_checkpoint_is_reported_and_the_previous_one_resumes_to_the_same_bit
     let workspace = Workspace::new();
     let options = "--steps 50 --checkpoint-every 20";
     workspace.trained("run", options);
-    let expected = workspace.read("run/model.ply");
+    let expected = workspace.model("run");
     let checkpoint = workspace.path("run/checkpoint.safetensors");
     let whole = fs::read(&checkpoint).unwrap();
     fs::remove_file(workspace.path("run/done.json")).unwrap();
@@ -268,7 +219,7 @@ fn a_damaged_checkpoint_is_reported_and_the_previous_one_resumes_to_the_same_bit
         fs::write(&checkpoint, damaged).unwrap();
         let (_, stderr) = run(&workspace.train("run", &format!("{options} --resume")), 0);
         says(&stderr, &["checkpoint.safetensors", "previous checkpoint"]);
-        assert!(workspace.read("run/model.ply") == expected);
+        assert!(workspace.model("run") == expected);
         fs::remove_file(workspace.path("run/done.json")).unwrap();
     }
     fs::write(&checkpoint, &flipped).unwrap();
@@ -281,21 +232,18 @@ fn a_run_resumes_only_with_its_own_dataset() {
     let workspace = Workspace::new();
     workspace.trained("run", "--steps 12 --checkpoint-every 10");
     let resumed = workspace.train("run", "--steps 14 --resume");
-    let (photograph, other) =
-        (workspace.path("set/low/003.png"), workspace.path("set/low/004.png"));
-    let before = fs::read(&photograph).unwrap();
-    fs::copy(&other, &photograph).unwrap();
+    let (photograph, listing) = ("set/low/003.png", "set/transforms_train.json");
+    let before = workspace.read(photograph);
+    workspace.write(photograph, workspace.read("set/low/004.png"));
     refused(&resumed, 3, &["another dataset", "view 003 shows other pixels"]);
-    fs::remove_file(&photograph).unwrap();
-    let (_, stderr) = run(&resumed, 3);
-    assert!(stderr.contains("another dataset (view 003 is gone)"), "{stderr}");
-    fs::write(&photograph, before).unwrap();
-    let listing = workspace.path("set/transforms_train.json");
-    let text = fs::read_to_string(&listing).unwrap();
-    fs::write(&listing, text.replace("\"fl_x\": ", "\"fl_x\": 1")).unwrap();
+    fs::remove_file(workspace.path(photograph)).unwrap();
+    says(&run(&resumed, 3).1, &["another dataset (view 003 is gone)"]);
+    workspace.write(photograph, before);
+    let text = workspace.text(listing);
+    workspace.write(listing, text.replace("\"fl_x\": ", "\"fl_x\": 1"));
     refused(&resumed, 3, &["another dataset", "another camera or pose"]);
     // In another folder, it is the same dataset.
-    fs::write(&listing, text).unwrap();
+    workspace.write(listing, text);
     fs::rename(workspace.path("set"), workspace.path("moved")).unwrap();
     succeed(&resumed.replace("/set ", "/moved "));
 }
@@ -338,17 +286,12 @@ fn two_runs_and_a_resumed_one_have_equal_ledgers() {
 fn hostile_names_break_no_table_and_reach_no_terminal() {
     let workspace = Workspace::new();
     let wild = "a,\u{1b}[31mb";
-    for (folder, stem) in [("low", "003"), ("high", "003")] {
-        let folder = workspace.path("set").join(folder);
-        if folder.join(format!("{stem}.png")).exists() {
-            fs::rename(folder.join(format!("{stem}.png")), folder.join(format!("{wild}.png")))
-                .unwrap();
-        }
+    for folder in ["set/low", "set/high"].map(|folder| workspace.path(folder)) {
+        fs::rename(folder.join("003.png"), folder.join(format!("{wild}.png"))).unwrap();
     }
-    let listing = workspace.path("set/transforms_train.json");
-    let text = fs::read_to_string(&listing).unwrap();
-    let text = text.replace("low/003.png", "low/a,\\u001b[31mb.png");
-    fs::write(&listing, text.replace("low/005.png", "low/gone\\u001b]0;x\\u0007.png")).unwrap();
+    let listing = "set/transforms_train.json";
+    let text = workspace.text(listing).replace("low/003.png", "low/a,\\u001b[31mb.png");
+    workspace.write(listing, text.replace("low/005.png", "low/gone\\u001b]0;x\\u0007.png"));
     let (stdout, stderr) = run(&workspace.train("run", "--steps 9"), 0);
     assert!(
         stderr.contains("gone") && !(stdout + &stderr).contains(['\u{1b}', '\u{7}']),
@@ -365,10 +308,8 @@ fn too_little_address_space_is_reported_before_a_driver_crashes() {
     let workspace = Workspace::new();
     let program = command("").get_program().to_str().unwrap().to_owned();
     for kilobytes in [300_000, 600_000] {
-        let line = format!(
-            "ulimit -v {kilobytes}; exec {program} {}",
-            workspace.train("run", "--steps 1")
-        );
+        let train = workspace.train("run", "--steps 1");
+        let line = format!("ulimit -v {kilobytes}; exec {program} {train}");
         let output = Command::new("sh").args(["-c", &line]).output().unwrap();
         let stderr = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(4), "{stderr}");

@@ -4,15 +4,14 @@ use nightsplat::Error;
 use nightsplat::results::run::load_config;
 use nightsplat::splats::model::Model;
 
-use crate::common::command::{Folder, json, refused, run, succeed};
+use crate::common::command::{json, refused};
 use crate::common::prelude::*;
 
 #[test]
 fn a_run_starts_from_a_model_and_its_highest_sh_degree() {
     let workspace = Workspace::new();
     workspace.trained("first", "--steps 30");
-    let model = workspace.path("first/model.ply");
-    workspace.trained("second", &format!("--steps 1 --init {}", model.display()));
+    workspace.trained("second", "--steps 1 --init @first/model.ply");
     let [first, second] =
         ["first", "second"].map(|run| ply::load(workspace.path(run).join("model.ply")).unwrap());
     // The first run has not reached a higher degree; the second uses it from its first step.
@@ -20,14 +19,11 @@ fn a_run_starts_from_a_model_and_its_highest_sh_degree() {
     assert_eq!(first.count, second.count);
     let moved = first.means().iter().zip(second.means()).map(|(a, b)| a.distance(*b));
     assert!(moved.fold(0.0, f32::max) < 0.05, "they began elsewhere");
-    let config = workspace.text("second/config.toml");
-    assert!(config.contains("first/model.ply"), "{config}");
+    says(&workspace.text("second/config.toml"), &["first/model.ply"]);
 
     // From another program: without our features, with additional properties, of a lower degree.
-    let bytes = with_property(&fs::read(&model).unwrap());
-    workspace.write("foreign.ply", bytes);
-    let foreign = workspace.path("foreign.ply");
-    workspace.trained("third", &format!("--steps 1 --init {}", foreign.display()));
+    workspace.write("foreign.ply", with_property(&workspace.model("first")));
+    workspace.trained("third", "--steps 1 --init @foreign.ply");
 }
 
 /// A binary PLY with an additional float in every vertex.
@@ -47,63 +43,51 @@ fn with_property(bytes: &[u8]) -> Vec<u8> {
 #[test]
 fn an_unsuitable_initial_model_is_refused_in_one_line_with_file_and_rule() {
     let workspace = Workspace::new();
-    let file = |name: &str, bytes: &[u8]| {
-        workspace.write(name, bytes);
-    };
     // All zeros; the file is text.
     ply::save(&Gaussians::zeros(2, 2), workspace.path("degree.ply")).unwrap();
     let whole = String::from_utf8(workspace.read("degree.ply")).unwrap();
-    let header = |from: &str, to: &str| whole.replacen(from, to, 1).into_bytes();
-    file("ascii.ply", &header("binary_little_endian", "ascii"));
-    file("big.ply", &header("binary_little_endian", "binary_big_endian"));
-    file("points.ply", &header("property float opacity\n", "property float alpha\n"));
-    file("origin.ply", &header("element", "comment world = position + 1 2\nelement"));
-    for (name, rule) in [
-        ("degree.ply", "has SH degree 2, more than sh_degree, which is 1"),
-        ("ascii.ply", "is truncated: 2 vertices need a line each"),
-        ("big.ply", "of format binary_big_endian; save it as binary_little_endian"),
-        ("points.ply", "has no property `opacity`"),
-        ("origin.ply", "names the origin `1 2`, which is not three finite numbers"),
-        ("none.ply", "none.ply"),
+    let (opacity, alpha) = ("property float opacity\n", "property float alpha\n");
+    let origin = "comment world = position + 1 2\nelement";
+    let big = "of format binary_big_endian; save it as binary_little_endian";
+    for (from, to, rule) in [
+        ("", "", "has SH degree 2, more than sh_degree, which is 1"),
+        ("binary_little_endian", "ascii", "is truncated: 2 vertices need a line each"),
+        ("binary_little_endian", "binary_big_endian", big),
+        (opacity, alpha, "has no property `opacity`"),
+        ("element", origin, "names the origin `1 2`, which is not three finite numbers"),
     ] {
-        let options = format!("--steps 1 --init @{name}");
-        refused(&workspace.train("run", &options), 3, &[name, rule]);
+        workspace.write("changed.ply", whole.replacen(from, to, 1));
+        let train = workspace.train("run", "--steps 1 --init @changed.ply");
+        refused(&train, 3, &["changed.ply", rule]);
     }
+    refused(&workspace.train("run", "--steps 1 --init @none.ply"), 3, &["none.ply"]);
 }
 
 #[test]
 fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
     let workspace = Workspace::new();
     workspace.trained("run", "--steps 40");
-    let (model, set) = (workspace.path("copy.ply"), workspace.path("set"));
-    fs::copy(workspace.path("run/model.ply"), &model).unwrap();
-    let (model, set) = (model.display(), set.display());
-
-    let (scores, message) = workspace.run(&format!("eval {model} --dataset {set} --json"), 0);
+    workspace.write("copy.ply", workspace.model("run"));
+    let (scores, message) = workspace.run("eval @copy.ply --dataset @set --json", 0);
     assert!(!message.contains("near plane"), "{message}");
     let psnr = |scores: &str| json(scores)["mean"]["psnr"].as_f64().unwrap();
     let of_run = workspace.succeed("eval @run --json");
     assert!((psnr(&scores) - psnr(&of_run)).abs() < 1e-6, "{scores} {of_run}");
-    workspace.refused(&format!("eval {model}"), 3, &["copy.ply", "--dataset"]);
+    workspace.refused("eval @copy.ply", 3, &["copy.ply", "--dataset"]);
 
-    let pictures = workspace.path("pictures");
-    workspace.succeed(&format!(
-        "render {model} --dataset {set} --split test --out {}",
-        pictures.display()
-    ));
-    assert!(fs::read_dir(pictures).unwrap().count() > 0);
+    workspace.succeed("render @copy.ply --dataset @set --split test --out @pictures");
+    assert!(fs::read_dir(workspace.path("pictures")).unwrap().count() > 0);
 
     for to in ["spz", "glb", "sog"] {
-        workspace.succeed(&format!("export {model} --format {to} --up none"));
+        workspace.succeed(&format!("export @copy.ply --format {to} --up none"));
         assert!(workspace.path(&format!("copy.{to}")).is_file(), "{to}");
     }
-    for (file, loss) in [("copy.spz", 0.5), ("copy.sog", 0.5)] {
-        let packed = workspace.path(file);
-        let shown = workspace.succeed(&format!("eval {} --dataset {set} --json", packed.display()));
-        assert!((psnr(&shown) - psnr(&of_run)).abs() < loss, "{file}: {shown} {of_run}");
+    for file in ["copy.spz", "copy.sog"] {
+        let shown = workspace.succeed(&format!("eval @{file} --dataset @set --json"));
+        assert!((psnr(&shown) - psnr(&of_run)).abs() < 0.5, "{file}: {shown} {of_run}");
     }
-    workspace.succeed(&format!("export {model} --format html --dataset {set}"));
-    workspace.refused(&format!("export {model} --format html"), 3, &["copy.ply", "--dataset"]);
+    workspace.succeed("export @copy.ply --format html --dataset @set");
+    workspace.refused("export @copy.ply --format html", 3, &["copy.ply", "--dataset"]);
 }
 
 /// Removes the facts that the file states.
@@ -148,11 +132,8 @@ fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_de
         let path = workspace.path(name);
         match name.strip_prefix("a.") {
             Some(format) => {
-                let out = path.display();
-                succeed(&format!(
-                    "export {} --format {format} --out {out} --up none",
-                    run_folder.display()
-                ));
+                let to = format!("--format {format} --out @{name} --up none");
+                workspace.succeed(&format!("export @run {to}"));
             }
             None => model.save(&path).unwrap(),
         }
@@ -174,10 +155,8 @@ fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_de
     without_facts(&file);
     assert_eq!(Model::load(&run_folder).unwrap(), Model { law: None, ..model });
     assert_eq!(Model::load(&file).unwrap(), Model::from(shown));
-    let set = workspace.path("set");
-    let silent = format!("eval {} --dataset {}", file.display(), set.display());
-    let (_, message) = run(&silent, 0);
-    assert!(message.contains("model.ply: does not state its near plane"), "{message}");
+    let (_, message) = workspace.run("eval @run/model.ply --dataset @set", 0);
+    says(&message, &["model.ply: does not state its near plane"]);
 }
 
 #[test]
@@ -197,23 +176,17 @@ fn an_invalid_fact_in_a_file_is_an_error_of_one_line() {
         let fact = problem.strip_suffix("; export the model again");
         fact.unwrap_or_else(|| panic!("no remedy: {problem}")).to_owned()
     };
-    for near in ["x", "-1", "0", "NaN", "inf", ""] {
-        let stated = problem(&format!("nightsplat near {near}"));
-        let expected = format!("line 7 states near `{near}`, which is not a finite number above 0");
-        assert_eq!(stated, expected);
+    let above_0 = ["x", "-1", "0", "NaN", "inf", ""]
+        .map(|near| ("nightsplat near", near, "states near", "a finite number above 0"));
+    for (comment, value, verb, rule) in above_0.into_iter().chain([
+        ("nightsplat max_alpha", "1", "states max_alpha", "a finite number between 0 and 1"),
+        ("world = position +", "1 2", "names the origin", "three finite numbers"),
+    ]) {
+        let expected = format!("line 7 {verb} `{value}`, which is not {rule}");
+        assert_eq!(problem(&format!("{comment} {value}")), expected);
     }
-    assert_eq!(
-        problem("nightsplat max_alpha 1"),
-        "line 7 states max_alpha `1`, which is not a finite number between 0 and 1"
-    );
-    assert_eq!(
-        problem("nightsplat raw_colors on"),
-        "line 7 states raw_colors `on`, which is neither true nor false"
-    );
-    assert_eq!(
-        problem("world = position + 1 2"),
-        "line 7 names the origin `1 2`, which is not three finite numbers"
-    );
+    let neither = "line 7 states raw_colors `on`, which is neither true nor false";
+    assert_eq!(problem("nightsplat raw_colors on"), neither);
     // Facts of later versions are skipped.
     Model::from(Gaussians::zeros(2, 0)).save(&path).unwrap();
     let text = fs::read_to_string(&path).unwrap();
@@ -235,19 +208,17 @@ fn an_export_keeps_the_origin_and_the_page_the_near_plane() {
     let mut gaussians = ply::load(&path).unwrap();
     gaussians.origin = DVec3::new(4_499_999.6, 519_997.7, 10_001.8);
     ply::save(&gaussians, &path).unwrap();
-    let (run, out) = (workspace.path("run"), workspace.path("out.ply"));
-    let message =
-        succeed(&format!("export {} --format ply --out {}", run.display(), out.display()));
-    assert!(message.contains("world = position + 4499999.6 519997.7 10001.8"), "{message}");
-    assert_eq!(ply::load(&out).unwrap(), gaussians.with_sh_degree(3));
+    let message = workspace.succeed("export @run --format ply --out @out.ply");
+    says(&message, &["world = position + 4499999.6 519997.7 10001.8"]);
+    assert_eq!(ply::load(workspace.path("out.ply")).unwrap(), gaussians.with_sh_degree(3));
     let line = "comment world = position + 4499999.6 519997.7 10001.8";
-    assert!(String::from_utf8_lossy(&fs::read(&out).unwrap()).contains(line));
+    says(&String::from_utf8_lossy(&workspace.read("out.ply")), &[line]);
 
-    succeed(&format!("export {} --format html", run.display()));
-    let html = fs::read_to_string(Path::new(&run).join("model.html")).unwrap();
+    workspace.succeed("export @run --format html");
+    let html = workspace.text("run/model.html");
     let (_, after) = html.split_once("\"near\":").unwrap();
     let near: f64 = after.split([',', '}']).next().unwrap().parse().unwrap();
-    let config = load_config(&run).unwrap();
+    let config = load_config(&workspace.path("run")).unwrap();
     let scale = config.frame.unwrap_or_default().scale;
     assert!((near - 1.0 / scale).abs() < 1e-6, "{near} at a scale of {scale}");
 }
@@ -258,13 +229,13 @@ fn training_far_from_the_origin_of_the_world_says_what_positions_are_relative_to
     let near = workspace.trained("near", "--steps 2");
     assert!(!near.contains("relative"), "{near}");
     for listing in ["transforms_train.json", "transforms_test.json"] {
-        let path = workspace.path("set").join(listing);
-        let mut listed: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+        let listing = format!("set/{listing}");
+        let mut listed = workspace.json(&listing);
         for frame in listed["frames"].as_array_mut().unwrap() {
             let x = &mut frame["transform_matrix"][0][3];
             *x = (x.as_f64().unwrap() + 448_262.5).into();
         }
-        fs::write(&path, listed.to_string()).unwrap();
+        workspace.write(&listing, listed.to_string());
     }
     let far = workspace.trained("far", "--steps 2");
     assert!(far.contains("model.ply: positions are relative"), "{far}");

@@ -13,18 +13,15 @@ fn renders_of_another_program_are_scored_like_our_own() {
     let ours = json(workspace.succeed("eval @a --save-images --json"));
     // Our renders in another folder are those of another program.
     fs::rename(workspace.path("a/eval/renders"), workspace.path("theirs")).unwrap();
-    let page = path("page.html");
     let eval = "eval @a --renders @theirs";
-    let theirs = json(workspace.succeed(&format!("{eval} --report {page} --json")));
+    let theirs = json(workspace.succeed(&format!("{eval} --report @page.html --json")));
     assert_eq!((&theirs["mean"], &theirs["views"]), (&ours["mean"], &ours["views"]));
     assert!(theirs["gaussians"].is_null() && theirs["renders"] == path("theirs"), "{theirs}");
-    assert!(fs::read_to_string(&page).unwrap().contains("theirs"));
+    says(&workspace.text("page.html"), &["theirs"]);
 
     let compare = "compare @a --renders gsplat=@theirs";
-    let stdout = workspace.succeed(&format!("{compare} --report {page}"));
-    assert!(stdout.contains("gsplat gains"), "{stdout}");
-    let html = fs::read_to_string(&page).unwrap();
-    assert!(html.contains("Comparison of a, gsplat") && html.contains(">gsplat<"), "{html}");
+    says(&workspace.succeed(&format!("{compare} --report @page.html")), &["gsplat gains"]);
+    says(&workspace.text("page.html"), &["Comparison of a, gsplat", ">gsplat<"]);
     let runs = json(workspace.succeed(&format!("{compare} --json")))["runs"].clone();
     assert_eq!(runs[0]["mean"]["psnr"], runs[1]["mean"]["psnr"]);
     assert!(runs[1]["run"] == "gsplat" && runs[1]["gaussians"].is_null(), "{runs}");
@@ -33,7 +30,7 @@ fn renders_of_another_program_are_scored_like_our_own() {
     let sweep = "sweep @set --out @sweep --curves ap3,min(t*a,1)^0.5;a=0.7 --steps 2 --sh-degree 0 \
                  --renders gsplat=@theirs";
     let stdout = workspace.succeed(sweep);
-    assert!(stdout.contains("min(t*a,1)^0.5;a=0.7") && stdout.contains("gsplat"), "{stdout}");
+    says(&stdout, &["min(t*a,1)^0.5;a=0.7", "gsplat"]);
     let csv = workspace.text("sweep/leaderboard.csv");
     assert_eq!(csv.lines().count(), 4, "{csv}");
     let row = csv.lines().find(|line| line.contains("gsplat")).unwrap();
@@ -44,8 +41,7 @@ fn renders_of_another_program_are_scored_like_our_own() {
     // What is superfluous, of another size or missing is named.
     let stray = workspace.path("theirs/stray.png");
     Image::filled(5, 5, [0.5; 3]).save_png8(&stray).unwrap();
-    let (_, message) = workspace.run(eval, 0);
-    assert!(message.contains("no view is named like stray.png"), "{message}");
+    says(&workspace.run(eval, 0).1, &["no view is named like stray.png"]);
     fs::remove_file(&stray).unwrap();
     let files = fs::read_dir(workspace.path("theirs")).unwrap().flatten().map(|file| file.path());
     let name = files.min().unwrap();
@@ -63,16 +59,16 @@ fn renders_of_another_program_are_scored_like_our_own() {
 #[test]
 fn targets_of_another_program_are_trained_on_and_labelled_everywhere() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
-    let (set, toned) = (path("set"), path("toned"));
-    workspace.succeed(&format!("tone apply {set} --curve ap3 --out {toned}"));
+    workspace.succeed("tone apply @set --curve ap3 --out @toned");
     let train = |out: &str, options: &str| {
-        format!("train {set} --out @{out} --model plain --sh-degree 1 --steps 30 {options}")
+        format!("train @set --out @{out} --model plain --sh-degree 1 --steps 30 {options}")
     };
-    let (stdout, message) = workspace.run(&train("theirs", &format!("--targets {toned}")), 0);
+    let (stdout, message) = workspace.run(&train("theirs", "--targets @toned"), 0);
     let printed = (stdout + &message).split_whitespace().collect::<Vec<_>>().join(" ");
-    assert!(printed.contains("targets of another program, toned"), "{printed}");
-    assert!(printed.contains("% of their pixels are clipped at white"), "{printed}");
+    says(
+        &printed,
+        &["targets of another program, toned", "% of their pixels are clipped at white"],
+    );
 
     // Only the rounding to 8 bits differs from the curve that made them.
     workspace.succeed(&train("ours", "--curve ap3"));
@@ -83,7 +79,7 @@ fn targets_of_another_program_are_trained_on_and_labelled_everywhere() {
     assert!((theirs - ours).abs() < 0.3, "{theirs} and {ours} dB");
 
     let config = workspace.text("theirs/config.toml");
-    assert!(config.contains("curve = \"targets\""), "{config}");
+    says(&config, &["curve = \"targets\""]);
     let config: TrainConfig = toml::from_str(&config).unwrap();
     assert_eq!(config.tone.targets(), Some(workspace.path("toned").as_path()));
     let metrics = json(workspace.text("theirs/metrics.json"));
@@ -104,7 +100,7 @@ fn targets_of_another_program_are_trained_on_and_labelled_everywhere() {
     let label = json(workspace.succeed("eval @theirs --json"))["against"].clone();
     assert!(label.as_str().unwrap().contains("targets of another program"), "{label}");
 
-    let targets = |options: &str| train("no", &format!("--targets {toned} --plan none {options}"));
+    let targets = |options: &str| train("no", &format!("--targets @toned --plan none {options}"));
     workspace.refused(&targets("--curve ap3"), 2, &["--targets", "--curve"]);
     workspace.refused(
         &train("no", "--plan none --targets @nowhere"),
@@ -119,6 +115,8 @@ fn targets_of_another_program_are_trained_on_and_labelled_everywhere() {
     // As PNG of 16 bits, white: more than a hundredth of all pixels.
     Image::filled(40, 30, [1.0; 3]).save_png16(&first).unwrap();
     let (_, message) = workspace.run(&targets(""), 0);
-    assert!(message.contains("detail is lost") && message.contains("most in 001"), "{message}");
-    assert!(message.contains("1 more pictures are of no photograph, stray the first"), "{message}");
+    says(
+        &message,
+        &["detail is lost", "most in 001", "1 more pictures are of no photograph, stray the first"],
+    );
 }

@@ -33,8 +33,7 @@ fn a_profile_is_fitted_used_and_named_with_every_result() {
     says(&folder.text("page.html"), &[LABEL]);
 
     let train = "train @set --steps 2 --sh-degree 0";
-    let told = folder.succeed(&format!("{train} --profile @profile.toml --out @run"));
-    says(&told, &[LABEL]);
+    says(&folder.succeed(&format!("{train} --profile @profile.toml --out @run")), &[LABEL]);
     assert_eq!(folder.json("run/metrics.json")["with_reference"], LABEL);
     // The run does not need the file.
     fs::remove_file(&file).unwrap();

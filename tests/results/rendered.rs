@@ -1,5 +1,6 @@
 //! Layers, sizes, backgrounds and camera paths of renders.
 
+use crate::common::paths;
 use crate::common::prelude::*;
 
 fn image(path: &Path) -> Image {
@@ -12,10 +13,7 @@ fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
     workspace.trained("run", "--steps 40");
     let render = |options: &str, out: &str| {
         workspace.succeed(&format!("render @run --split test {options} --out @{out}"));
-        let mut files: Vec<_> =
-            fs::read_dir(workspace.path(out)).unwrap().map(|entry| entry.unwrap().path()).collect();
-        files.sort();
-        files.remove(0)
+        paths(&workspace.path(out)).remove(0)
     };
     let alpha = image(&render("--layer alpha --format exr", "alpha"));
     let light = image(&render("--layer transmittance --format exr", "light"));
@@ -50,32 +48,29 @@ fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
 #[test]
 fn views_and_paths_are_rendered_at_a_size_with_a_field_of_view_over_a_background() {
     let workspace = Workspace::new();
-    let path = |name: &str| workspace.path(name).display().to_string();
     workspace.trained("run", "--steps 10");
     let render = |options: &str, out: &str| format!("render @run {options} --out @{out}");
     workspace.succeed(&render("--split test --size 64x24 --fov 20", "wide"));
-    let file = fs::read_dir(workspace.path("wide")).unwrap().next().unwrap().unwrap().path();
+    let file = paths(&workspace.path("wide")).remove(0);
     assert_eq!([image(&file).width, image(&file).height], [64, 24]);
 
     let keyframes = r#"{"nightsplat_path": 1, "fps": 2, "fov": 40, "size": [32, 16], "keyframes": [
         {"time": 0, "position": [0, 0, 0], "target": [0, 0, 100]},
         {"time": 2, "position": [0, 0, 0], "target": [100, 0, 100]}]}"#;
     workspace.write("path.json", keyframes);
-    let file = path("path.json");
-    workspace.succeed(&render(&format!("--path {file} --background #ff0000"), "film"));
+    workspace.succeed(&render("--path @path.json --background #ff0000", "film"));
     assert_eq!(fs::read_dir(workspace.path("film")).unwrap().count(), 5);
     assert_eq!([image(&workspace.path("film/00000.png")).width], [32]);
     // Far from everything, only the background is seen.
-    let far = path("far.json");
     workspace
         .write("far.json", keyframes.replace("[0, 0, 0]", "[0, 0, 1e5]").replace("100]", "1e7]"));
-    workspace.succeed(&render(&format!("--path {far} --frames 1 --background 1,0,0"), "far"));
+    workspace.succeed(&render("--path @far.json --frames 1 --background 1,0,0", "far"));
     let far = image(&workspace.path("far/00000.png"));
     assert!(far.data[..512].iter().all(|value| *value == 1.0), "no red");
     assert!(far.data[512..].iter().all(|value| *value == 0.0));
 
     workspace.write("path.json", keyframes.replace("path\": 1", "path\": 7"));
-    workspace.refused(&render(&format!("--path {file}"), "no"), 3, &["path.json", "version 7"]);
+    workspace.refused(&render("--path @path.json", "no"), 3, &["path.json", "version 7"]);
     for (options, part) in [
         ("--path nowhere.json", "nor a file"),
         ("--split test --size 0x4", "is not WIDTHxHEIGHT"),

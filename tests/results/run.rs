@@ -185,10 +185,8 @@ fn a_planned_run_is_extended_on_its_original_views() {
     let folder = Folder::empty();
     folder.succeed("synth @set --views 20 --width 32 --height 24");
     let short = "--set steps=6 --checkpoint-every 3 --progress plain";
-    let message = folder.succeed(&train("run", short));
-    assert!(message.contains("held-out view"), "{message}");
-    let message = folder.succeed(&train("run", "--steps 9 --resume --progress none"));
-    assert!(message.contains("9 steps"), "{message}");
+    says(&folder.succeed(&train("run", short)), &["held-out view"]);
+    says(&folder.succeed(&train("run", "--steps 9 --resume --progress none")), &["9 steps"]);
 }
 
 #[test]

@@ -3,8 +3,8 @@
 use nightsplat::networks::lpips::Network;
 
 use crate::common::command::json;
-use crate::common::lpips;
 use crate::common::prelude::*;
+use crate::common::{lpips, paths};
 
 #[test]
 fn references_that_are_found_later_give_the_scores_of_a_dataset_that_had_them() {
@@ -48,17 +48,14 @@ fn a_sweep_adds_lpips_to_its_tables_and_scores_no_run_again() {
     let sweep = "sweep @large --out @sweep --curves ap3,ase --steps 2 --sh-degree 0";
     let stdout = workspace.succeed(sweep);
     assert!(!stdout.contains("LPIPS"), "{stdout}");
-    let with = format!("{sweep} --lpips {}", weights.display());
+    let with = format!("{sweep} --lpips @weights.safetensors");
     let (stdout, message) = workspace.run(&with, 0);
     assert!(stdout.contains("LPIPS") && !message.contains("finished"), "{stdout}\n{message}");
-    let runs = |folder: &Path| -> Vec<PathBuf> {
-        let all = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
-        all.filter(|path| path.join("model.ply").exists()).collect()
-    };
-    let found = runs(&workspace.path("sweep"));
+    let mut found = paths(&workspace.path("sweep"));
+    found.retain(|path| path.join("model.ply").exists());
     assert_eq!(found.len(), 2);
     for folder in &found {
-        let eval = format!("eval {} --lpips {} --json", folder.display(), weights.display());
+        let eval = format!("eval {} --lpips @weights.safetensors --json", folder.display());
         let lpips_of_run = json(workspace.succeed(&eval))["mean"]["lpips"].as_f64().unwrap();
         assert!(stdout.contains(&format!("{lpips_of_run:.3}")), "{lpips_of_run}: {stdout}");
     }
@@ -66,8 +63,8 @@ fn a_sweep_adds_lpips_to_its_tables_and_scores_no_run_again() {
     assert_eq!(stdout, again);
 
     fs::write(&weights, "no weights").unwrap();
-    let other = workspace.path("other.safetensors");
-    fs::write(&other, "no weights").unwrap();
-    workspace.refused(&format!("{sweep} --lpips {}", other.display()), 3, &["other.safetensors"]);
+    workspace.write("other.safetensors", "no weights");
+    let other = format!("{sweep} --lpips @other.safetensors");
+    workspace.refused(&other, 3, &["other.safetensors"]);
     workspace.refused(&format!("{sweep} --lpips-range unit"), 2, &["--lpips <WEIGHTS>"]);
 }

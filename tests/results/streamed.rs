@@ -8,8 +8,9 @@ use nightsplat_models::export::streamed::{self, Division, INDEX, TileLoader, Wri
 use nightsplat_models::levels::level;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
-use crate::common::command::{Folder, refused, succeed};
+use crate::common::command::json;
 use crate::common::prelude::*;
+use crate::common::{contents, paths};
 
 /// Tiles of 300 and of 130 Gaussians side by side, each with an origin of its own.
 fn tiles() -> [Gaussians; 2] {
@@ -37,17 +38,16 @@ fn written(folder: &Path, models: &[Gaussians], division: Division) -> nightspla
 }
 
 fn index(folder: &Path) -> Value {
-    serde_json::from_slice(&fs::read(folder.join(INDEX)).unwrap()).unwrap()
+    json(fs::read(folder.join(INDEX)).unwrap())
 }
 
 /// The Gaussians of a chunk, given by the path of its description.
 fn chunk(folder: &Path, meta: &str) -> Gaussians {
     let mut zip = ZipWriter::new(Cursor::new(vec![]));
-    for entry in fs::read_dir(folder.join(meta).parent().unwrap()).unwrap() {
-        let entry = entry.unwrap();
-        let name = entry.file_name().into_string().unwrap();
+    for path in paths(folder.join(meta).parent().unwrap()) {
+        let name = path.file_name().unwrap().to_str().unwrap();
         zip.start_file(name, SimpleFileOptions::default()).unwrap();
-        zip.write_all(&fs::read(entry.path()).unwrap()).unwrap();
+        zip.write_all(&fs::read(&path).unwrap()).unwrap();
     }
     let file = tempfile::NamedTempFile::new().unwrap();
     fs::write(file.path(), zip.finish().unwrap().into_inner()).unwrap();
@@ -90,12 +90,12 @@ fn errors(gaussians: &Gaussians, other: &Gaussians) -> [f32; 4] {
 
 #[test]
 fn the_index_finds_every_gaussian_of_every_level_once_and_chunks_are_our_levels() {
-    let (folder, models) = (tempfile::tempdir().unwrap(), tiles());
+    let (folder, models) = (Folder::empty(), tiles());
     let division = Division { levels: Some(3), chunk: 160 };
-    let Written { counts, chunks } = written(folder.path(), &models, division).unwrap();
+    let Written { counts, chunks } = written(&folder, &models, division).unwrap();
     // Cells of at most 40: eight of 37 or 38, and four of 32 or 33.
     assert_eq!(counts, [430, 4 * 19 + 4 * 19 + 2 * 16 + 2 * 17, 8 * 10 + 2 * 8 + 2 * 9]);
-    let index = index(folder.path());
+    let index = index(&folder);
     let names = index["filenames"].as_array().unwrap();
     assert_eq!((names.len(), index["version"].as_u64()), (chunks, Some(1)));
     assert_eq!(index["count"], counts.iter().sum::<usize>());
@@ -123,7 +123,7 @@ fn the_index_finds_every_gaussian_of_every_level_once_and_chunks_are_our_levels(
             assert_eq!(offset, ends[file], "{name}: a gap");
             ends[file] += count;
             let indices: Vec<u32> = (offset as u32..(offset + count) as u32).collect();
-            let cell = chunk(folder.path(), name).select(&indices);
+            let cell = chunk(&folder, name).select(&indices);
             for mean in cell.means() {
                 let mean = mean.as_dvec3();
                 assert!(
@@ -134,7 +134,7 @@ fn the_index_finds_every_gaussian_of_every_level_once_and_chunks_are_our_levels(
         }
     }
     for (name, end) in names.iter().zip(ends) {
-        assert_eq!(chunk(folder.path(), name.as_str().unwrap()).count, end, "{name}");
+        assert_eq!(chunk(&folder, name.as_str().unwrap()).count, end, "{name}");
         assert!(end <= division.chunk);
     }
     for (k, cells) in found.iter().enumerate() {
@@ -148,36 +148,17 @@ fn the_index_finds_every_gaussian_of_every_level_once_and_chunks_are_our_levels(
     }
 }
 
-/// All files of a folder and its folders, by name.
-fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
-    let mut all = vec![];
-    for entry in fs::read_dir(folder).unwrap() {
-        let path = entry.unwrap().path();
-        let name = path.file_name().unwrap().to_string_lossy().into_owned();
-        match path.is_dir() {
-            true => all.extend(
-                files(&path)
-                    .into_iter()
-                    .map(|(name_below, bytes)| (name.clone() + &name_below, bytes)),
-            ),
-            false => all.push((name, fs::read(&path).unwrap())),
-        }
-    }
-    all.sort();
-    all
-}
-
 #[test]
 fn the_same_tiles_are_the_same_bytes_and_replace_an_earlier_export() {
-    let [first, second] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    let [first, second] = [(); 2].map(|()| Folder::empty());
     let division = Division { levels: None, chunk: 100 };
     let models = tiles();
-    written(first.path(), &models, division).unwrap();
-    written(second.path(), &models[..1], Division { chunk: 16, ..division }).unwrap();
-    written(second.path(), &models, division).unwrap();
-    assert!(files(first.path()) == files(second.path()));
+    written(&first, &models, division).unwrap();
+    written(&second, &models[..1], Division { chunk: 16, ..division }).unwrap();
+    written(&second, &models, division).unwrap();
+    assert!(contents(&first) == contents(&second));
     // 430 Gaussians are 54 on the fourth level.
-    assert_eq!(index(first.path())["lodLevels"], 4);
+    assert_eq!(index(&first)["lodLevels"], 4);
 }
 
 #[test]
@@ -187,7 +168,7 @@ fn a_folder_with_anything_else_and_tiles_that_changed_are_refused_and_nothing_is
     let division = Division::default();
     folder.write("letter.txt", "mine");
     let problem = written(&folder, std::slice::from_ref(&model), division).unwrap_err().to_string();
-    assert!(problem.contains("letter.txt") && files(&folder).len() == 1, "{problem}");
+    assert!(problem.contains("letter.txt") && contents(&folder).len() == 1, "{problem}");
     fs::remove_file(folder.path("letter.txt")).unwrap();
 
     let mut tile = TileLoader::whole(Path::new("0007.ply"), &model);
@@ -204,24 +185,20 @@ fn a_folder_with_anything_else_and_tiles_that_changed_are_refused_and_nothing_is
 fn the_command_writes_levels_and_refuses_options_of_other_formats() {
     let folder = Folder::empty();
     let [model, _] = tiles();
-    let root = folder.display();
     ply::save(&model, folder.path("a.ply")).unwrap();
-    let line =
-        succeed(&format!("export {root}/a.ply --format streamed-sog --levels 2 --chunk 160"));
-    assert!(line.contains("2 levels of 300, 152 Gaussians in 3 chunks"), "{line}");
+    let line = folder.succeed("export @a.ply --format streamed-sog --levels 2 --chunk 160");
+    says(&line, &["2 levels of 300, 152 Gaussians in 3 chunks"]);
     assert_eq!(index(&folder.path("a.streamed-sog"))["counts"], serde_json::json!([300, 152]));
 
-    succeed(&format!("export {root}/a.ply --format ply --level 1 --chunk 160 --out {root}/b.ply"));
+    folder.succeed("export @a.ply --format ply --level 1 --chunk 160 --out @b.ply");
     let half = ply::load(folder.path("b.ply")).unwrap();
     assert_eq!(half, level(&model, &[model.count], 40, 1).with_sh_degree(3));
-    for (options, part) in [
-        ("--format sog --levels 2", "--level"),
-        ("--format streamed-sog --level 1", "--levels"),
-        ("--format streamed-sog --levels 0", "--levels 0"),
-        ("--format sog --level 16", "--level 16"),
-        ("--format sog --chunk 0", "--chunk 0"),
-        ("--format streamed-sog --out a.sog", "--format sog"),
-    ] {
-        refused(&format!("export {root}/a.ply {options}"), 2, &[part]);
-    }
+    folder.refuses_all(
+        "2 | export @a.ply --format sog --levels 2 | --level
+         2 | export @a.ply --format streamed-sog --level 1 | --levels
+         2 | export @a.ply --format streamed-sog --levels 0 | --levels 0
+         2 | export @a.ply --format sog --level 16 | --level 16
+         2 | export @a.ply --format sog --chunk 0 | --chunk 0
+         2 | export @a.ply --format streamed-sog --out a.sog | --format sog",
+    );
 }

@@ -3,8 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-use crate::common::command::{Folder, succeed};
 use crate::common::png::put_chunk;
+use crate::common::{Folder, paths};
 
 /// Exif that says: turn a quarter clockwise.
 const TURNED: &[u8] = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0";
@@ -39,28 +39,26 @@ fn are_upright(page: &Path) {
 #[test]
 fn pages_and_event_files_show_photographs_and_renders_upright() {
     let folder = Folder::empty();
-    let root = folder.display();
-    succeed(&format!("synth {root}/set --views 9 --width 40 --height 32"));
+    folder.succeed("synth @set --views 9 --width 40 --height 32");
     for part in ["low", "high"] {
-        for entry in fs::read_dir(folder.path("set").join(part)).unwrap() {
-            put_chunk(&entry.unwrap().path(), b"eXIf", TURNED);
+        for path in paths(&folder.path("set").join(part)) {
+            put_chunk(&path, b"eXIf", TURNED);
         }
     }
     let options = "--plan none --curve ase --steps 4 --progress none";
-    succeed(&format!("train {root}/set --out {root}/run --tensorboard --eval-every 2 {options}"));
-    let written = fs::read_dir(folder.path("run/tensorboard")).unwrap();
-    let events: Vec<u8> =
-        written.flat_map(|entry| fs::read(entry.unwrap().path()).unwrap()).collect();
+    folder.succeed(&format!("train @set --out @run --tensorboard --eval-every 2 {options}"));
+    let written = paths(&folder.path("run/tensorboard"));
+    let events: Vec<u8> = written.iter().flat_map(|path| fs::read(path).unwrap()).collect();
     let holds = |part: &[u8]| events.windows(part.len()).any(|bytes| bytes == part);
     assert!(holds(&header(32, 40)) && !holds(&header(40, 32)));
 
-    succeed(&format!("eval {root}/run --report {root}/eval.html"));
+    folder.succeed("eval @run --report @eval.html");
     are_upright(&folder.path("eval.html"));
-    succeed(&format!("diagnose {root}/set --report {root}/diagnosis.html"));
+    folder.succeed("diagnose @set --report @diagnosis.html");
     let diagnosis = folder.text("diagnosis.html");
     assert!(
         diagnosis.contains("width=\"32\" height=\"40\"") && !diagnosis.contains("height=\"32\"")
     );
-    succeed(&format!("sweep {root}/set --out {root}/sweep --curves ase --steps 4"));
+    folder.succeed("sweep @set --out @sweep --curves ase --steps 4");
     are_upright(&folder.path("sweep/index.html"));
 }

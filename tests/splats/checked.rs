@@ -13,17 +13,9 @@ use crate::common::setup::{Gradients, tile_of, variants};
 
 /// Six views of 40 x 30 pixels with depth maps, as the model requires.
 fn dataset(config: &TrainConfig) -> Dataset {
-    let folder = tempfile::tempdir().unwrap();
-    let options = small_set(6, [40, 30], 1);
-    nightsplat_synth::write(folder.path(), &options).unwrap();
-    let depth = folder.path().join("depth");
-    fs::create_dir(&depth).unwrap();
-    let map = Image::from_fn(20, 15, |x, y| [1.0 - (y as f32 + 0.1 * x as f32) / 20.0; 3]);
-    for file in fs::read_dir(folder.path().join("low")).unwrap() {
-        let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
-        map.save_png16(depth.join(format!("depth_{name}.png"))).unwrap();
-    }
-    Dataset::load(folder.path(), &config.load_options()).unwrap()
+    let folder = Folder::empty();
+    crate::common::train::write_with_depth(&folder);
+    Dataset::load(folder, &config.load_options()).unwrap()
 }
 
 /// A quarter of the points, as references take most of the time. The plain steps keep all: more than a block to sort.
@@ -40,10 +32,7 @@ fn config(parts: &[Part]) -> TrainConfig {
     config.schedule.densify_interval = 2;
     config.schedule.sh_degree_interval = 1;
     config.density.gradient_threshold = 1e-6;
-    config.model.set_parts(parts);
-    config.model.network.channels = 4;
-    config.model.network.stages = 2;
-    config.model.network.repeats = 2;
+    set_small_parts(&mut config, parts);
     config
 }
 
@@ -394,16 +383,14 @@ fn data_that_is_not_finite_gives_no_difference_and_no_panic() {
 #[test]
 fn the_command_checks_a_dataset_and_names_the_buffer_that_differs() {
     use clap::Parser as _;
-    let folder = tempfile::tempdir().unwrap();
-    let options = small_set(3, [24, 18], 1);
-    nightsplat_synth::write(folder.path(), &options).unwrap();
+    let folder = written(&small_set(3, [24, 18], 1));
     let check = |path: &Path| {
         let arguments = ["nightsplat", "check", path.to_str().unwrap(), "--steps", "1", "--json"];
         nightsplat::cli::Cli::try_parse_from(arguments).unwrap().run()
     };
-    check(folder.path()).unwrap();
+    check(&folder).unwrap();
     // The red of the background.
     let defect = Defect { kernel: "blend_forward", word: 4, bits: 0x3f80_0000 };
-    let error = with_defect(defect, || check(folder.path())).unwrap_err().to_string();
-    assert!(error.contains("`blend_forward`") && error.contains("render["), "{error}");
+    let error = with_defect(defect, || check(&folder)).unwrap_err().to_string();
+    says(&error, &["`blend_forward`", "render["]);
 }

@@ -131,14 +131,13 @@ fn unusual_datasets_have_a_defined_brightness_or_a_clear_error() {
 /// Targets are area means of tone-mapped photographs, not tone-mapped means.
 #[test]
 fn photographs_are_tone_mapped_before_they_are_downscaled() {
-    let folder = tempfile::tempdir().unwrap();
     let options = small_set(5, [96, 72], 1);
-    nightsplat_synth::write(folder.path(), &options).unwrap();
-    let load = || {
+    let folder = written(&options);
+    let load = |folder: &Folder| {
         let options = LoadOptions { downscale: 3.0, ..LoadOptions::default() };
-        Dataset::load(folder.path(), &options).unwrap()
+        Dataset::load(folder, &options).unwrap()
     };
-    let shrunk = load();
+    let shrunk = load(&folder);
     let view = &shrunk.views[1];
     let original = view.photograph().unwrap().unwrap();
     assert_eq!([original.width, original.height], [96, 72]);
@@ -158,20 +157,13 @@ fn photographs_are_tone_mapped_before_they_are_downscaled() {
     let scene = SceneTone::from_photographs(&settings, &measured).unwrap();
     for ((name, photograph), measured) in photographs.iter().zip(&measured) {
         let tone_mapped = pseudo_gt.tone_mapped(photograph, &scene.mapping_of(measured)).unwrap();
-        tone_mapped.save_png16(folder.path().join("low").join(format!("{name}.png"))).unwrap();
+        tone_mapped.save_png16(folder.join("low").join(format!("{name}.png"))).unwrap();
     }
-    let elsewhere = train(&config(ToneSettings::new(ToneCurve::None)), &load()).0;
+    let elsewhere = train(&config(ToneSettings::new(ToneCurve::None)), &load(&folder)).0;
     for (a, b) in expected.iter().zip(&elsewhere) {
         assert!((a - b).abs() < 1e-4, "{expected:?} and {elsewhere:?}");
     }
-    let late =
-        train(&config(ToneSettings { full_resolution: false, ..settings }), &load_dark(&options)).0;
+    let dark = load(&written(&options));
+    let late = train(&config(ToneSettings { full_resolution: false, ..settings }), &dark).0;
     assert_ne!(expected, late);
-}
-
-/// The same dataset, as it was written.
-fn load_dark(options: &SyntheticOptions) -> Dataset {
-    let folder = tempfile::tempdir().unwrap();
-    nightsplat_synth::write(folder.path(), options).unwrap();
-    Dataset::load(folder.path(), &LoadOptions { downscale: 3.0, ..Default::default() }).unwrap()
 }

@@ -122,10 +122,7 @@ fn seeding_with_every_part_gives_the_same_bits_however_steps_are_submitted_and_i
     let dataset = dataset(12).1;
     for parts in [&[][..], &[Part::Structure, Part::Denoiser]] {
         let mut config = TrainConfig { steps: 44, ..config() };
-        config.model.set_parts(parts);
-        config.model.network.channels = 4;
-        config.model.network.stages = 2;
-        config.model.network.repeats = 2;
+        set_small_parts(&mut config, parts);
         config.model.denoiser_crop = 16;
         config.exposure.learn = parts.is_empty();
         let gpu = gpu();

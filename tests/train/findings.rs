@@ -1,47 +1,20 @@
 //! What is odd about photographs is said by every command that looks at them, and corrected where it can be.
 
-use std::fs;
-use std::path::Path;
-
 use nightsplat_diagnose::Diagnosis;
-use nightsplat_photographs::dataset::{Dataset, LoadOptions, RowBands, View};
-use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
-use nightsplat_synth::{Capture, SyntheticOptions};
+use nightsplat_photographs::dataset::{LoadOptions, RowBands, View};
 
-use crate::common::command::{run, succeed, unwrapped};
-
-const SET: SyntheticOptions = SyntheticOptions {
-    views: 16,
-    width: 96,
-    height: 72,
-    seed: 4,
-    fisheye: false,
-    street: None,
-    lamp: None,
-    night: nightsplat_synth::Night::NONE,
-    normals: false,
-};
+use crate::common::command::unwrapped;
+use crate::common::prelude::*;
 
 /// A dark set whose training photographs are changed by a function of photograph, column, row and linear light.
-fn changed(change: impl Fn(usize, [u32; 2], f64) -> f64) -> tempfile::TempDir {
-    let folder = tempfile::tempdir().unwrap();
+fn changed(change: impl Fn(usize, [u32; 2], f64) -> f64) -> Folder {
     let capture = Capture { darkening: 6.0, ..Capture::default() };
-    nightsplat_synth::write_captured(folder.path(), &SET, &capture).unwrap();
-    let entries = fs::read_dir(folder.path().join("low")).unwrap();
-    let mut paths: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
-    paths.sort();
-    for (index, path) in paths.iter().enumerate() {
-        let image = Image::load(path).unwrap();
-        let pixel = |x, y| {
-            let light = |value: f32| change(index, [x, y], linear_from_srgb(value).into()) as f32;
-            image.pixel(x, y).map(|value| srgb_from_linear(light(value)).clamp(0.0, 1.0))
-        };
-        Image::from_fn(image.width, image.height, pixel).save_png8(path).unwrap();
-    }
+    let folder = captured(&small_set(16, [96, 72], 4), &capture);
+    relit(&folder, change);
     folder
 }
 
-fn plain() -> tempfile::TempDir {
+fn plain() -> Folder {
     changed(|_, _, light| light)
 }
 
@@ -51,7 +24,7 @@ fn off([x, y]: [u32; 2]) -> f64 {
     (f64::from(x) + 0.5 - half[0]).hypot(f64::from(y) + 0.5 - half[1]) / half[0].hypot(half[1])
 }
 
-fn vignetted() -> tempfile::TempDir {
+fn vignetted() -> Folder {
     changed(|_, at, light| light / (1.0 + off(at).powi(2)).powi(2))
 }
 
@@ -62,14 +35,14 @@ fn diagnosed(folder: &Path) -> (Dataset, Diagnosis) {
 #[test]
 fn a_plain_set_has_no_finding_and_keeps_its_bits() {
     let folder = plain();
-    let (dataset, found) = diagnosed(folder.path());
+    let (dataset, found) = diagnosed(&folder);
     // The synthetic room has views of few edges.
     let mut remarks = found.remarks.iter().filter(|remark| !remark.contains("more blurred"));
     assert_eq!(remarks.next(), None);
     let falloff = found.scene.falloff.unwrap();
     assert!(!falloff.is_found() && !falloff.is_corrected && falloff.corner > 0.8, "{falloff:?}");
     let plain = LoadOptions { mask_overlays: false, falloff: Some([0.0; 2]), ..Default::default() };
-    let as_stored = Dataset::load(folder.path(), &plain).unwrap();
+    let as_stored = Dataset::load(&folder, &plain).unwrap();
     for (view, stored) in dataset.views.iter().zip(&as_stored.views) {
         assert!(view.image == stored.image && view.mask.is_none(), "{}", view.name);
     }
@@ -78,11 +51,11 @@ fn a_plain_set_has_no_finding_and_keeps_its_bits() {
 #[test]
 fn dark_corners_are_measured_and_evened_out_in_memory_and_when_read_again() {
     let (even, folder) = (plain(), vignetted());
-    let falloff = diagnosed(folder.path()).1.scene.falloff.unwrap();
+    let falloff = diagnosed(&folder).1.scene.falloff.unwrap();
     assert!(falloff.is_found() && falloff.is_corrected, "{falloff:?}");
     assert!((falloff.corner - 0.25).abs() < 0.06 && falloff.error < 0.1, "{falloff:?}");
     let uncorrected = LoadOptions { falloff: Some([0.0; 2]), ..LoadOptions::default() };
-    let (_, left) = Diagnosis::load(folder.path(), &uncorrected).unwrap();
+    let (_, left) = Diagnosis::load(&folder, &uncorrected).unwrap();
     assert!(!left.scene.falloff.unwrap().is_corrected);
     let light = |folder: &Path, options: &LoadOptions| -> Vec<f64> {
         let dataset = Dataset::load(folder, options).unwrap();
@@ -95,36 +68,37 @@ fn dark_corners_are_measured_and_evened_out_in_memory_and_when_read_again() {
         images.map(outer).collect()
     };
     let evened = LoadOptions { falloff: Some(falloff.falloff), ..LoadOptions::default() };
-    let truth = light(even.path(), &LoadOptions::default());
-    let dark = light(folder.path(), &LoadOptions::default());
-    let kept = light(folder.path(), &evened);
+    let truth = light(&even, &LoadOptions::default());
+    let dark = light(&folder, &LoadOptions::default());
+    let kept = light(&folder, &evened);
     for ((evened, dark), truth) in kept.iter().zip(dark).zip(truth) {
         assert!(dark < 0.45 * truth && (evened / truth).log2().abs() < 0.3, "{evened} for {truth}");
     }
     let read_again = LoadOptions { keep: Some(0), ..evened };
-    assert_eq!(light(folder.path(), &read_again), kept);
+    assert_eq!(light(&folder, &read_again), kept);
 }
 
 #[test]
-fn a_run_records_the_falloff_and_a_plan_file_repeats_it() {
-    let folder = vignetted();
-    let (root, out) = (folder.path().display(), folder.path().join("run"));
-    let plan = folder.path().join("plan.toml");
-    let text = succeed(&format!("diagnose {root} --plan {}", plan.display()));
-    let line = text.lines().find(|line| line.starts_with("falloff")).unwrap();
-    assert!(line.contains(" on "), "{line}");
-    assert!(unwrapped(&text).contains("of the light of the middle"), "{text}");
-    let printed = succeed(&format!("tone apply {root}"));
-    assert!(unwrapped(&printed).contains("of the light of the middle"), "{printed}");
-    for more in [String::new(), format!("--plan {}", plan.display())] {
-        let (printed, _) =
-            run(&format!("train {root} --out {} --steps 2 --overwrite {more}", out.display()), 0);
-        assert!(printed.contains(line), "{printed}");
-        let config = fs::read_to_string(out.join("config.toml")).unwrap();
-        assert!(config.lines().any(|line| line.starts_with("falloff = ")), "{config}");
+fn a_run_records_what_it_evens_out_and_a_plan_file_repeats_it() {
+    let middle = ["of the light of the middle"];
+    let elsewhere = ["in 2.5 bands that lie elsewhere in each"];
+    for (folder, name, of_line, of_diagnosis, of_tone, recorded, off) in [
+        (vignetted(), "falloff", " on ", &middle[..], middle, "\nfalloff = ", "falloff=0"),
+        (banded(), "bands", "rows differ by 1.", &[], elsewhere, "[bands.waves]", "bands={}"),
+    ] {
+        let text = folder.succeed("diagnose @ --plan @plan.toml");
+        let line = text.lines().find(|line| line.starts_with(name)).unwrap();
+        says(line, &[" on ", of_line]);
+        says(&unwrapped(&text), of_diagnosis);
+        says(&unwrapped(&folder.succeed("tone apply @")), &of_tone);
+        let train = "train @ --out @run --steps 2 --overwrite";
+        for more in ["", "--plan @plan.toml"] {
+            says(&folder.succeed(&format!("{train} {more}")), &[line]);
+            says(&folder.text("run/config.toml"), &[recorded]);
+        }
+        let printed = folder.succeed(&format!("{train} --set {off}"));
+        assert!(!printed.contains(&format!("{name}  on")), "{printed}");
     }
-    let off = format!("train {root} --out {} --steps 2 --overwrite --set falloff=0", out.display());
-    assert!(!run(&off, 0).0.lines().any(|line| line.starts_with("falloff  on")));
 }
 
 /// Two and a half bands with a third more or less light, elsewhere in each photograph; the light of a row.
@@ -132,7 +106,7 @@ fn band(index: usize, y: f64) -> f64 {
     1.0 + 0.35 * (std::f64::consts::TAU * y / 28.8 + 2.4 * index as f64).sin()
 }
 
-fn banded() -> tempfile::TempDir {
+fn banded() -> Folder {
     changed(|index, [_, y], light| light * band(index, f64::from(y) + 0.5))
 }
 
@@ -150,7 +124,7 @@ fn light_of_rows(folder: &Path, options: &LoadOptions) -> Vec<Vec<f64>> {
 #[test]
 fn bands_of_rows_are_measured_and_evened_out_in_memory_and_when_read_again() {
     let (even, folder) = (plain(), banded());
-    let found = diagnosed(folder.path()).1.scene.bands.unwrap();
+    let found = diagnosed(&folder).1.scene.bands.unwrap();
     assert!(found.is_found() && found.is_corrected, "{found:?}");
     // log2(1.35 / 0.65) is 1.05.
     assert!((found.stops - 1.05).abs() < 0.1, "{}", found.stops);
@@ -158,11 +132,11 @@ fn bands_of_rows_are_measured_and_evened_out_in_memory_and_when_read_again() {
     let heights = found.rows.waves.values().map(|[c, s]| c.hypot(*s));
     assert!(heights.clone().count() > 10 && heights.clone().all(|m| (m - 0.35).abs() < 0.08));
     let left = LoadOptions { bands: Some(RowBands::default()), ..LoadOptions::default() };
-    let (_, kept) = Diagnosis::load(folder.path(), &left).unwrap();
+    let (_, kept) = Diagnosis::load(&folder, &left).unwrap();
     assert!(!kept.scene.bands.unwrap().is_corrected);
     let evened = LoadOptions { bands: Some(found.rows), ..LoadOptions::default() };
-    let truth = light_of_rows(even.path(), &LoadOptions::default());
-    let [banded, kept] = [&left, &evened].map(|options| light_of_rows(folder.path(), options));
+    let truth = light_of_rows(&even, &LoadOptions::default());
+    let [banded, kept] = [&left, &evened].map(|options| light_of_rows(&folder, options));
     // The largest difference of a row, stops.
     let worst = |set: &[Vec<f64>]| -> f64 {
         let rows = set.iter().flatten().zip(truth.iter().flatten());
@@ -170,7 +144,7 @@ fn bands_of_rows_are_measured_and_evened_out_in_memory_and_when_read_again() {
     };
     assert!(worst(&banded) > 0.55 && worst(&kept) < 0.2, "{} {}", worst(&banded), worst(&kept));
     let read_again = LoadOptions { keep: Some(0), ..evened };
-    assert_eq!(light_of_rows(folder.path(), &read_again), kept);
+    assert_eq!(light_of_rows(&folder, &read_again), kept);
 }
 
 #[test]
@@ -178,31 +152,10 @@ fn bands_and_dark_corners_are_told_apart() {
     let folder = changed(|index, [x, y], light| {
         light * band(index, f64::from(y) + 0.5) / (1.0 + off([x, y]).powi(2)).powi(2)
     });
-    let scene = diagnosed(folder.path()).1.scene;
+    let scene = diagnosed(&folder).1.scene;
     let (bands, falloff) = (scene.bands.unwrap(), scene.falloff.unwrap());
     assert!(bands.is_corrected && (bands.stops - 1.05).abs() < 0.15, "{bands:?}");
     assert!(falloff.is_corrected && (falloff.corner - 0.25).abs() < 0.08, "{falloff:?}");
-}
-
-#[test]
-fn a_run_records_bands_and_a_plan_file_repeats_them() {
-    let folder = banded();
-    let (root, out) = (folder.path().display(), folder.path().join("run"));
-    let plan = folder.path().join("plan.toml");
-    let text = succeed(&format!("diagnose {root} --plan {}", plan.display()));
-    let line = text.lines().find(|line| line.starts_with("bands")).unwrap();
-    assert!(line.contains(" on ") && line.contains("rows differ by 1."), "{line}");
-    let printed = succeed(&format!("tone apply {root}"));
-    let words = printed.split_whitespace().collect::<Vec<_>>().join(" ");
-    assert!(words.contains("in 2.5 bands that lie elsewhere in each"), "{printed}");
-    let train = format!("train {root} --out {} --steps 2 --overwrite", out.display());
-    for more in [String::new(), format!("--plan {}", plan.display())] {
-        let (printed, _) = run(&format!("{train} {more}"), 0);
-        assert!(printed.contains(line), "{printed}");
-        let config = fs::read_to_string(out.join("config.toml")).unwrap();
-        assert!(config.contains("[bands.waves]"), "{config}");
-    }
-    assert!(!run(&format!("{train} --set bands={{}}"), 0).0.contains("bands  on"));
 }
 
 #[test]
@@ -210,9 +163,9 @@ fn weak_bands_and_clean_sets_are_left_as_they_are() {
     // A fifth of them.
     let weak = changed(|index, [_, y], light| light * band(index, f64::from(y) + 0.5).powf(0.2));
     let even = plain();
-    let mut sets = vec![even.path().to_owned(), weak.path().to_owned()];
-    let shared = ["data/lom/chair", "data/lom/sofa", "data/lom/shrub", "data/fox"];
-    sets.extend(shared.iter().filter_map(|set| crate::common::shared(set)));
+    let mut sets = vec![even.to_path_buf(), weak.to_path_buf()];
+    let captures = ["data/lom/chair", "data/lom/sofa", "data/lom/shrub", "data/fox"];
+    sets.extend(captures.iter().filter_map(|set| shared(set)));
     for set in sets {
         let bands = diagnosed(&set).1.scene.bands.unwrap();
         println!("{}: {:.2} {:.2}", set.display(), bands.share, bands.stops);
@@ -232,26 +185,21 @@ fn what_is_burnt_in_is_masked_in_every_view_and_said() {
         _ => 0.0,
     };
     let folder = changed(bar);
-    let root = folder.path().display();
-    let (dataset, _) = diagnosed(folder.path());
+    let (dataset, _) = diagnosed(&folder);
     for view in dataset.train_views() {
         let mask = view.mask.as_ref().unwrap();
         let is_hidden = |y: usize| mask.weights[96 * y..][..96].iter().all(|&weight| weight == 0.0);
         assert!((56..72).all(is_hidden), "{}", view.name);
         assert!((0..52).all(|y| mask.weights[96 * y..][..96].iter().all(|&one| one == 1.0)));
     }
-    let out = folder.path().join("out");
-    for command in
-        [format!("diagnose {root}"), format!("tone apply {root} --out {}", out.display())]
-    {
-        let (_, warned) = run(&command, 0);
-        assert!(warned.contains("to 71, columns 0 to 95 of the photographs of 96x72"), "{warned}");
+    for command in ["diagnose @", "tone apply @ --out @out"] {
+        says(&folder.run(command, 0).1, &["to 71, columns 0 to 95 of the photographs of 96x72"]);
     }
-    let train = format!("train {root} --out {} --steps 2 --set mask_overlays=false", out.display());
-    assert!(!run(&(train + " --overwrite"), 0).1.contains("hardly change"));
+    let train = "train @ --out @out --steps 2 --set mask_overlays=false --overwrite";
+    assert!(!folder.run(train, 0).1.contains("hardly change"));
     // Its last rows are a black border as well.
     let plain = LoadOptions { mask_overlays: false, mask_borders: false, ..LoadOptions::default() };
-    let dataset = Dataset::load(folder.path(), &plain).unwrap();
+    let dataset = Dataset::load(&folder, &plain).unwrap();
     assert!(dataset.views.iter().all(|view| view.mask.is_none()));
 }
 
@@ -259,14 +207,10 @@ fn what_is_burnt_in_is_masked_in_every_view_and_said() {
 fn every_command_that_looks_at_photographs_says_what_is_odd() {
     let veil = f64::from(linear_from_srgb(24.0 / 255.0));
     let folder = changed(|_, _, light| light + veil);
-    let (root, out) = (folder.path().display(), folder.path().join("run"));
-    let finding = "black is raised: no photograph is darker than 25 of 255";
+    let finding = ["black is raised: no photograph is darker than 25 of 255"];
     for command in ["diagnose", "diagnose --json", "tone apply", "tone apply --json"] {
-        let (printed, _) = run(&format!("{command} {root}"), 0);
-        assert!(printed.contains(finding), "{command}: {printed}");
+        says(&folder.succeed(&format!("{command} @")), &finding);
     }
-    let (_, warned) = run(&format!("train {root} --out {} --steps 2", out.display()), 0);
-    assert!(warned.contains(finding), "{warned}");
-    let (printed, _) = run(&format!("tone apply {root} --brightness 0.9"), 0);
-    assert!(printed.contains("near white (0.94 and above)"), "{printed}");
+    says(&folder.run("train @ --out @run --steps 2", 0).1, &finding);
+    says(&folder.succeed("tone apply @ --brightness 0.9"), &["near white (0.94 and above)"]);
 }

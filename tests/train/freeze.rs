@@ -7,10 +7,10 @@ use crate::common::train::{dataset, train};
 const GEOMETRY: &str = "means,quats,scales,opacities";
 
 /// A model of a few steps, as a file.
-fn day(folder: &tempfile::TempDir) -> (PathBuf, Gaussians) {
+fn day(folder: &Path) -> (PathBuf, Gaussians) {
     let (_, gaussians) =
         train(&TrainConfig { steps: 30, ..TrainConfig::bare() }, &dataset(6, [40, 30]));
-    let path = folder.path().join("day.ply");
+    let path = folder.join("day.ply");
     gaussians.save(&path).unwrap();
     (path, gaussians)
 }
@@ -29,7 +29,7 @@ fn config(init: PathBuf, freeze: &str) -> TrainConfig {
 
 #[test]
 fn frozen_geometry_keeps_its_bits_and_colours_learn_on_any_device() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = Folder::empty();
     let (path, day) = day(&folder);
     let dataset = dataset(6, [40, 30]);
     for gpu in [gpu(), gpu_with(|properties| properties.is_cpu = false)] {
@@ -68,12 +68,12 @@ fn frozen_geometry_keeps_its_bits_and_colours_learn_on_any_device() {
 /// More Gaussians than a binding holds, the last batch with an odd number.
 #[test]
 fn frozen_geometry_in_batches_gives_the_bits_of_one_batch_and_resumes() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = Folder::empty();
     let dataset = Dataset { points: vec![], ..dataset(6, [40, 30]) };
     let mut random = TrainConfig { steps: 2, random_points: 4205, ..TrainConfig::bare() };
     // Small Gaussians, which intersect few tiles: a binding holds the intersections of all of them.
     random.start.scale = 0.1;
-    let path = folder.path().join("day.ply");
+    let path = folder.join("day.ply");
     train(&random, &dataset).1.save(&path).unwrap();
     let (whole, little) =
         (gpu(), gpu_with(|properties| properties.max_storage_buffer_range = 1 << 19));
@@ -91,7 +91,7 @@ fn frozen_geometry_in_batches_gives_the_bits_of_one_batch_and_resumes() {
     for trainer in [&mut expected, &mut batched] {
         advance(trainer, 12);
     }
-    let checkpoint = folder.path().join("checkpoint.safetensors");
+    let checkpoint = folder.join("checkpoint.safetensors");
     batched.save_checkpoint(&checkpoint).unwrap();
     let mut resumed = new(&whole);
     resumed.restore(&checkpoint).unwrap();
@@ -109,7 +109,7 @@ fn bytes<T: bytemuck::NoUninit>(values: &[T]) -> Vec<u8> {
 
 #[test]
 fn a_frozen_attribute_between_trained_ones_does_not_change() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = Folder::empty();
     let (path, _) = day(&folder);
     let dataset = dataset(6, [40, 30]);
     let mut trainer = Trainer::new(&gpu(), config(path, "dc,scales"), &dataset).unwrap();
@@ -122,7 +122,7 @@ fn a_frozen_attribute_between_trained_ones_does_not_change() {
 
 #[test]
 fn a_model_of_another_world_is_warned_of_with_the_count() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = Folder::empty();
     let (path, mut day) = day(&folder);
     let dataset = dataset(6, [40, 30]);
     let new = |path: PathBuf| {
@@ -130,7 +130,7 @@ fn a_model_of_another_world_is_warned_of_with_the_count() {
     };
     assert!(!new(path).contains("out of sight"));
     day.means_mut().iter_mut().for_each(|mean| *mean += 1e4);
-    let elsewhere = folder.path().join("elsewhere.ply");
+    let elsewhere = folder.join("elsewhere.ply");
     day.save(&elsewhere).unwrap();
     let warned = new(elsewhere);
     let count = format!("{0} of {0} Gaussians are out of sight of every camera", day.count);
@@ -139,7 +139,7 @@ fn a_model_of_another_world_is_warned_of_with_the_count() {
 
 #[test]
 fn colours_on_frozen_geometry_are_scored_every_fifty_steps() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = Folder::empty();
     let (path, _) = day(&folder);
     let config = TrainConfig { steps: 110, ..config(path, GEOMETRY) };
     let mut dataset = dataset(6, [40, 30]);

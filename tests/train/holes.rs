@@ -6,34 +6,24 @@ use nightsplat::results::eval::{
 use nightsplat::train::{Background, Part};
 use nightsplat_photographs::dataset::View;
 use nightsplat_photographs::image::Mask;
-use nightsplat_synth::Night;
 
-use crate::common::command::{self, succeed, unwrapped};
+use crate::common::command::{json, unwrapped};
+use crate::common::paths;
 use crate::common::prelude::*;
 use crate::common::train::train;
 
-const SET: SyntheticOptions = SyntheticOptions {
-    views: 12,
-    width: 64,
-    height: 48,
-    seed: 1,
-    fisheye: false,
-    street: None,
-    lamp: None,
-    night: Night::NONE,
-    normals: false,
-};
+fn set() -> SyntheticOptions {
+    small_set(12, [64, 48], 1)
+}
 
 /// A room lit by one lamp: everything outside its light, including objects in front of walls, is black and has no
 /// points.
-fn dark_room() -> tempfile::TempDir {
+fn dark_room() -> Folder {
     /// Pixels whose channel mean is below this become black.
     const DARK: f32 = 0.5;
-    let folder = tempfile::tempdir().unwrap();
-    nightsplat_synth::write_captured(folder.path(), &SET, &Capture::clean()).unwrap();
+    let folder = captured(&set(), &Capture::clean());
     for part in ["low", "high"] {
-        for file in fs::read_dir(folder.path().join(part)).unwrap() {
-            let path = file.unwrap().path();
+        for path in paths(&folder.join(part)) {
             let image = Image::load(&path).unwrap();
             let shown = |x, y| {
                 let pixel = image.pixel(x, y);
@@ -42,9 +32,9 @@ fn dark_room() -> tempfile::TempDir {
             Image::from_fn(image.width, image.height, shown).save_png8(&path).unwrap();
         }
     }
-    let dataset = load(folder.path());
+    let dataset = load(&folder);
     let (camera, image) = (dataset.views[1].camera, dataset.views[1].image.as_ref().unwrap());
-    rewrite_points(folder.path(), |position| {
+    rewrite_points(&folder, |position| {
         let pixel = camera.sees(position).map(|pixel| pixel.as_uvec2());
         pixel.is_some_and(|pixel| image.pixel(pixel.x, pixel.y) != [0.0; 3])
     });
@@ -93,7 +83,7 @@ fn residuals(background: Background, dataset: &Dataset) -> (Vec<f64>, Option<Str
 #[test]
 fn a_dark_room_has_reported_holes_over_black_and_none_over_random_colours() {
     let folder = dark_room();
-    let dataset = load(folder.path());
+    let dataset = load(&folder);
     let (hollow, warning) = residuals(Background::Black, &dataset);
     assert!(hollow.iter().all(|&mean| mean > 1.5 * MAX_RESIDUAL_TRANSMITTANCE), "{hollow:?}");
     let warning = warning.unwrap();
@@ -105,19 +95,18 @@ fn a_dark_room_has_reported_holes_over_black_and_none_over_random_colours() {
 
 #[test]
 fn a_black_point_cloud_trains_as_well_as_a_grey_one() {
-    let folder = tempfile::tempdir().unwrap();
-    nightsplat_synth::write(folder.path(), &SET).unwrap();
+    let folder = written(&set());
     let config = TrainConfig { steps: 30, ..TrainConfig::bare() };
-    let grey = train(&config, &load(folder.path())).1;
-    rewrite_points(folder.path(), |_| true);
-    let black = train(&config, &load(folder.path())).1;
+    let grey = train(&config, &load(&folder)).1;
+    rewrite_points(&folder, |_| true);
+    let black = train(&config, &load(&folder)).1;
     assert!(black.count > 100 && black.parameters == grey.parameters, "{}", black.count);
 }
 
 #[test]
 fn masked_pixels_are_not_holes() {
     let folder = dark_room();
-    let dataset = load(folder.path());
+    let dataset = load(&folder);
     let mut trainer = Trainer::new(&gpu(), config(Background::Black), &dataset).unwrap();
     let view = dataset.test_views().next().unwrap();
     let rendered = trainer.render(&view.camera).unwrap();
@@ -158,41 +147,32 @@ fn a_denoiser_and_patches_do_not_change_the_transmittances() {
 #[test]
 fn holes_are_reported_by_train_eval_and_diagnose() {
     let folder = dark_room();
-    let set = folder.path().display();
-    let run = format!("{set}/run");
     let short = "--curve none --steps 60 --background black --progress none";
-    let (_, warned) = command::run(&format!("train {set} --out {run} {short}"), 0);
+    let (_, warned) = folder.run(&format!("train @ --out @run {short}"), 0);
     let warning =
         |text: &str| text.lines().filter(|line| line.contains("of the background")).count();
     assert!(warning(&warned) == 1 && warned.contains("--background random"), "{warned}");
-    let trained: Value =
-        serde_json::from_slice(&fs::read(format!("{run}/metrics.json")).unwrap()).unwrap();
-    let (scored, warned) = command::run(&format!("eval {run} --json"), 0);
+    let (scored, warned) = folder.run("eval @run --json", 0);
     assert_eq!(warning(&warned), 1, "{warned}");
-    let scored: Value = serde_json::from_str(&scored).unwrap();
-    let residual_transmittance = &scored["residual_transmittance"];
+    let residual_transmittance = &json(scored)["residual_transmittance"];
+    let trained = folder.json("run/metrics.json");
     assert_eq!(*residual_transmittance, trained["residual_transmittance"]);
     let of = |what: &Value| [&what["mean"], &what["q99"]].map(|value| value.as_f64().unwrap());
     let [mean, q99] = of(&residual_transmittance["mean"]);
     assert!(mean > MAX_RESIDUAL_TRANSMITTANCE && q99 > mean, "{residual_transmittance}");
     assert_eq!(residual_transmittance["views"].as_object().unwrap().len(), 2);
-    let table = succeed(&format!("eval {run}"));
-    for part in ["residual transmittance", "99 %", &format!("{mean:.4}"), &format!("{q99:.4}")] {
-        assert!(table.contains(part), "no {part} in {table}");
-    }
+    let parts = ["residual transmittance", "99 %", &format!("{mean:.4}"), &format!("{q99:.4}")];
+    says(&folder.succeed("eval @run"), &parts);
 
     // If no view is held out, training views are measured.
-    let all = format!("train {set} --out {set}/all --test-every 0 {short}");
-    let (_, warned) = command::run(&all, 0);
+    let (_, warned) = folder.run(&format!("train @ --out @all --test-every 0 {short}"), 0);
     assert!(warning(&warned) == 1 && warned.contains("of 6 views"), "{warned}");
 
-    let (message, _) = command::run(&format!("diagnose {set} --run {run}"), 0);
-    let message = unwrapped(&message);
+    let message = unwrapped(&folder.succeed("diagnose @ --run @run"));
     assert!(message.contains("note: view ") && warning(&message) == 1, "{message}");
-    let json: Value =
-        serde_json::from_str(&succeed(&format!("diagnose {set} --run {run} --json"))).unwrap();
-    let views = json["residual_transmittance"].as_object().unwrap();
-    assert_eq!(views.len(), SET.views);
+    let diagnosed = json(folder.succeed("diagnose @ --run @run --json"));
+    let views = diagnosed["residual_transmittance"].as_object().unwrap();
+    assert_eq!(views.len(), set().views);
     assert_eq!(of(&views["000"]), of(&residual_transmittance["views"]["000"]));
-    assert!(!succeed(&format!("diagnose {set} --json")).contains("residual_transmittance"));
+    assert!(!folder.succeed("diagnose @ --json").contains("residual_transmittance"));
 }

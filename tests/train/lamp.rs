@@ -6,7 +6,7 @@ use nightsplat::train::Part;
 use nightsplat_models::gaussians::init::Initialization;
 use nightsplat_photographs::dataset::{Point, View};
 
-use crate::common::command::{refused, run, says, succeed};
+use crate::common::command::json;
 use crate::common::prelude::*;
 
 /// The sides of a gallery along z, and half its length.
@@ -170,15 +170,12 @@ fn a_lamp_is_told_from_the_surfaces_that_it_lights() {
 
 #[test]
 fn a_lamp_that_is_not_there_does_not_hurt() {
-    let folder = tempfile::tempdir().unwrap();
-    let options =
-        SyntheticOptions { views: 17, width: 80, height: 60, seed: 4, ..Default::default() };
-    nightsplat_synth::write(folder.path(), &options).unwrap();
+    let folder = written(&small_set(17, [80, 60], 4));
     let score = |parts: &[Part]| {
         let mut config = TrainConfig { steps: 600, ..TrainConfig::bare() };
         config.tone.scene_statistics = true;
         config.model.set_parts(parts);
-        let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
+        let dataset = Dataset::load(&folder, &config.load_options()).unwrap();
         let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
         advance(&mut trainer, config.steps);
         // The curve's distance from the references is not the lamp's.
@@ -195,82 +192,49 @@ fn a_lamp_that_is_not_there_does_not_hurt() {
     assert!(lit > plain - 0.1, "without {plain:.2} dB, forced {lit:.2} dB");
 }
 
-fn metrics(run: &Path) -> Value {
-    serde_json::from_slice(&fs::read(run.join("metrics.json")).unwrap()).unwrap()
-}
-
 #[test]
 fn a_run_keeps_its_lamp_for_scores_and_for_a_flight_that_carries_it() {
-    let folder = tempfile::tempdir().unwrap();
-    let [set, run] = ["set", "run"].map(|name| folder.path().join(name));
-    let options =
-        SyntheticOptions { views: 9, width: 40, height: 30, seed: 2, ..Default::default() };
-    nightsplat_synth::write(&set, &options).unwrap();
-    let [set_name, run_name] = [&set, &run].map(|path| path.display().to_string());
-    succeed(&format!(
-        "train {set_name} --parts lamp --steps 30 --out {run_name} --set lamp.ambient=0"
-    ));
-    let lamp: Value = serde_json::from_slice(&fs::read(run.join("lamp.json")).unwrap()).unwrap();
+    let workspace = Workspace::new();
+    workspace.succeed("train @set --parts lamp --steps 30 --out @run --set lamp.ambient=0");
+    let lamp = workspace.json("run/lamp.json");
     assert!(lamp["reference_distance"].as_f64().unwrap() > 0.1, "{lamp}");
-    let config = fs::read_to_string(run.join("config.toml")).unwrap();
+    let config = workspace.text("run/config.toml");
     let gain = config.lines().find(|line| line.starts_with("scene_statistics")).unwrap();
-    assert!(gain.contains("true") && gain.contains("the part lamp"), "{gain}");
+    says(gain, &["true", "the part lamp"]);
 
-    let eval = |extra: &str| -> Value {
-        serde_json::from_str(&succeed(&format!("eval {run_name} --json{extra}"))).unwrap()
-    };
-    let lit = eval("");
+    let eval = || json(workspace.succeed("eval @run --json"));
+    let lit = eval();
     let psnr = |metrics: &Value| metrics["mean"]["psnr"].as_f64().unwrap();
-    assert!((psnr(&lit) - psnr(&metrics(&run))).abs() < 1e-3);
+    assert!((psnr(&lit) - psnr(&workspace.json("run/metrics.json"))).abs() < 1e-3);
     assert!(lit["lit_by_lamp"].is_null());
-    let [evenly, carried] = ["evenly", "carried"].map(|name| folder.path().join(name));
-    let out = evenly.display();
-    succeed(&format!("render {run_name} --split test --out {out}"));
-    let out = carried.display();
-    succeed(&format!("render {run_name} --split test --lamp --out {out}"));
-    let picture = |folder: &Path| fs::read(folder.join("000.png")).unwrap();
-    assert!(picture(&evenly) != picture(&carried));
+    workspace.succeed("render @run --split test --out @evenly");
+    workspace.succeed("render @run --split test --lamp --out @carried");
+    assert!(workspace.read("evenly/000.png") != workspace.read("carried/000.png"));
 
     // With its test views in the lamp's light, the references of a set are evenly lit.
-    fs::create_dir(set.join("lit")).unwrap();
     for name in ["000.png", "008.png"] {
-        fs::copy(carried.join(name), set.join("lit").join(name)).unwrap();
+        workspace.write(&format!("set/lit/{name}"), workspace.read(&format!("carried/{name}")));
     }
-    let both = eval("");
+    let both = eval();
     assert!(both["mean"] != lit["mean"]);
     let equal = &both["lit_by_lamp"]["mean"]["psnr"];
     assert!(equal.is_null(), "equal images have no finite PSNR: {both:#}");
     assert!(both["lit_by_lamp"]["mean"]["ssim"].as_f64().unwrap() > 0.999);
 
-    let without = folder.path().join("without");
-    let out = without.display();
-    succeed(&format!("train {set_name} --parts structure --steps 5 --out {out}"));
-    assert!(!without.join("lamp.json").exists());
-    let pictures = folder.path().join("none");
-    let flight = format!("render {out} --split test --lamp --out {}", pictures.display());
-    refused(&flight, 3, &["has no lamp", "leave out --lamp"]);
-    fs::write(run.join("lamp.json"), "{\"exponent\": 9}").unwrap();
-    refused(&format!("eval {run_name}"), 3, &["lamp.json", "is not a lamp"]);
+    workspace.succeed("train @set --parts structure --steps 5 --out @without");
+    assert!(!workspace.path("without/lamp.json").exists());
+    let flight = "render @without --split test --lamp --out @none";
+    workspace.refused(flight, 3, &["has no lamp", "leave out --lamp"]);
+    workspace.write("run/lamp.json", "{\"exponent\": 9}");
+    workspace.refused("eval @run", 3, &["lamp.json", "is not a lamp"]);
 }
 
 #[test]
 fn a_lamp_that_cannot_be_told_from_something_else_is_warned_of() {
-    let folder = tempfile::tempdir().unwrap();
-    let options =
-        SyntheticOptions { views: 3, width: 40, height: 30, seed: 2, ..Default::default() };
-    nightsplat_synth::write(folder.path(), &options).unwrap();
-    let (set, out) = (folder.path().display(), folder.path().join("run"));
-    let out = out.display();
-    let command = format!(
-        "train {set} --parts lamp --exposure on --steps 2 --set tone.scene_statistics=false --out {out}"
-    );
-    let (_, warnings) = run(&command, 0);
-    says(
-        &warnings,
-        &[
-            "2 training views do not tell a lamp",
-            "a gain of its own",
-            "exposures of views can take",
-        ],
-    );
+    let folder = written(&small_set(3, [40, 30], 2));
+    let options = "--exposure on --steps 2 --set tone.scene_statistics=false";
+    let (_, warnings) = folder.run(&format!("train @ --parts lamp {options} --out @run"), 0);
+    let parts =
+        ["2 training views do not tell a lamp", "a gain of its own", "exposures of views can take"];
+    says(&warnings, &parts);
 }

@@ -3,9 +3,8 @@
 use nightsplat::train::plan::Plan;
 use nightsplat_diagnose::{Diagnosis, LampDiagnosis, SceneDiagnosis};
 use nightsplat_photographs::dataset::LoadOptions;
-use nightsplat_photographs::image::srgb_from_linear;
 
-use crate::common::command::{says, succeed, unwrapped};
+use crate::common::command::{json, unwrapped};
 use crate::common::prelude::*;
 
 /// Of a room.
@@ -18,12 +17,6 @@ fn varying() -> Capture {
     Capture { stops: vec![0.0, -1.0, 0.6, -0.4, 0.3, 0.8, -0.7], ..Capture::default() }
 }
 
-fn written(options: &SyntheticOptions, capture: &Capture) -> tempfile::TempDir {
-    let folder = tempfile::tempdir().unwrap();
-    nightsplat_synth::write_captured(folder.path(), options, capture).unwrap();
-    folder
-}
-
 fn diagnosis(folder: &Path) -> Diagnosis {
     let options = LoadOptions::default();
     Diagnosis::new(&Dataset::load(folder, &options).unwrap(), &options).unwrap()
@@ -34,27 +27,13 @@ fn scene(folder: &Path) -> SceneDiagnosis {
 }
 
 fn lamp_of(options: &SyntheticOptions, capture: &Capture) -> LampDiagnosis {
-    let scene = scene(written(options, capture).path());
+    let scene = scene(&captured(options, capture));
     scene.lamp.unwrap_or_else(|| panic!("{:?}", scene.lamp_unknown))
 }
 
-/// Multiplies the linear light of every pixel of the photographs by a function of the photograph's number and of the
-/// pixel's distance from the middle, 0 to 1 in a corner.
-fn relit(folder: &Path, factor: impl Fn(usize, f64) -> f64) {
-    let mut paths: Vec<_> =
-        fs::read_dir(folder.join("low")).unwrap().map(|entry| entry.unwrap().path()).collect();
-    paths.sort();
-    for (index, path) in paths.iter().enumerate() {
-        let image = Image::load(path).unwrap();
-        let half = [image.width, image.height].map(|side| 0.5 * f64::from(side));
-        let relit = Image::from_fn(image.width, image.height, |x, y| {
-            let off =
-                (f64::from(x) - half[0]).hypot(f64::from(y) - half[1]) / half[0].hypot(half[1]);
-            let light = |value: f32| linear_from_srgb(value) * factor(index, off) as f32;
-            image.pixel(x, y).map(|value| srgb_from_linear(light(value)).clamp(0.0, 1.0))
-        });
-        relit.save_png8(path).unwrap();
-    }
+/// A pixel's distance from the middle, 0 to 1 in a corner.
+fn off([x, y]: [u32; 2]) -> f64 {
+    (f64::from(x) - 48.0).hypot(f64::from(y) - 36.0) / 60.0
 }
 
 #[test]
@@ -94,7 +73,7 @@ fn exposures_alone_are_no_lamp() {
 fn noise_alone_is_no_lamp() {
     for (seed, full_well) in [(1, 9000.0), (2, 900.0), (3, 200.0)] {
         let grainy = Capture { full_well, ..Capture::default() };
-        let scene = scene(written(&SyntheticOptions { seed, ..set(None) }, &grainy).path());
+        let scene = scene(&captured(&SyntheticOptions { seed, ..set(None) }, &grainy));
         println!("{:?} {:?}", scene.lamp, scene.lamp_unknown);
         let lamp = scene.lamp.filter(|lamp| lamp.is_found() || lamp.stops > 0.1);
         assert_eq!(lamp, None);
@@ -115,9 +94,9 @@ fn light_that_falls_on_a_place_is_no_lamp() {
 
 #[test]
 fn a_vignette_is_no_lamp() {
-    let folder = written(&set(None), &Capture::default());
-    relit(folder.path(), |_, off| (-2.0 * off * off).exp2());
-    let lamp = scene(folder.path()).lamp.unwrap();
+    let folder = written(&set(None));
+    relit(&folder, |_, at, light| light * (-2.0 * off(at) * off(at)).exp2());
+    let lamp = scene(&folder).lamp.unwrap();
     println!("{lamp:?}");
     assert!(lamp.stops > 0.15, "the vignette is to be seen: {lamp:?}");
     assert!(!lamp.is_found() && lamp.distance_stops < 0.08, "{lamp:?}");
@@ -131,25 +110,25 @@ fn clipped_photographs_few_views_and_one_position_measure_no_lamp() {
         let told = scene.lamp_unknown.unwrap();
         assert!(told.contains(why), "{told}");
     };
-    let folder = written(&set(Some(16.0)), &Capture::default());
-    let path = folder.path().join("transforms_train.json");
+    let folder = written(&set(Some(16.0)));
+    let path = folder.join("transforms_train.json");
     let whole = fs::read(&path).unwrap();
     let list = || -> Value { serde_json::from_slice(&whole).unwrap() };
 
     let mut fewer = list();
     fewer["frames"].as_array_mut().unwrap().truncate(4);
     fs::write(&path, fewer.to_string()).unwrap();
-    unknown(folder.path(), "in 4 views");
+    unknown(&folder, "in 4 views");
 
     fs::write(&path, &whole).unwrap();
-    relit(folder.path(), |_, _| 1e4);
-    unknown(folder.path(), "are unclipped");
+    relit(&folder, |_, _, light| 1e4 * light);
+    unknown(&folder, "are unclipped");
 
-    let folder = written(&set(Some(16.0)), &Capture::default());
-    let path = folder.path().join("transforms_train.json");
-    let points = Dataset::load(folder.path(), &LoadOptions::default()).unwrap().points;
-    fs::remove_dir_all(folder.path().join("colmap_sparse")).unwrap();
-    unknown(folder.path(), "0 points in 0 views");
+    let folder = written(&set(Some(16.0)));
+    let path = folder.join("transforms_train.json");
+    let points = Dataset::load(&folder, &LoadOptions::default()).unwrap().points;
+    fs::remove_dir_all(folder.join("colmap_sparse")).unwrap();
+    unknown(&folder, "0 points in 0 views");
     let mut still = list();
     let pose = still["frames"][0]["transform_matrix"].clone();
     for frame in still["frames"].as_array_mut().unwrap() {
@@ -164,15 +143,15 @@ fn clipped_photographs_few_views_and_one_position_measure_no_lamp() {
         "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n",
         points.len()
     );
-    fs::write(folder.path().join("points3D.ply"), header + &lines).unwrap();
-    unknown(folder.path(), "differ by 0.0 %");
+    fs::write(folder.join("points3D.ply"), header + &lines).unwrap();
+    unknown(&folder, "differ by 0.0 %");
 }
 
 #[test]
 fn the_plan_has_a_lamp_and_exposures_each_where_its_cause_is() {
     let plan = |lamp, capture: &Capture| {
-        let folder = written(&set(lamp), capture);
-        let found = diagnosis(folder.path());
+        let folder = captured(&set(lamp), capture);
+        let found = diagnosis(&folder);
         let mut config = TrainConfig::default();
         config.tone.scene_statistics = true;
         let plan = Plan::new(&found, &config, 8 << 30);
@@ -210,14 +189,12 @@ fn the_plan_has_a_lamp_and_exposures_each_where_its_cause_is() {
 #[test]
 fn a_run_learns_the_lamp_that_was_found_and_none_where_there_is_none() {
     for (lamp, learned) in [(Some(16.0), "lamp = true"), (None, "lamp = false")] {
-        let folder = written(&set(lamp), &Capture::default());
-        let out = folder.path().join("run");
-        succeed(&format!("train {} --out {} --steps 2", folder.path().display(), out.display()));
-        let config = fs::read_to_string(out.join("config.toml")).unwrap();
-        assert!(config.contains(learned), "no `{learned}` in {config}");
+        let folder = written(&set(lamp));
+        folder.succeed("train @ --out @run --steps 2");
+        let config = folder.text("run/config.toml");
+        says(&config, &[learned]);
         assert_eq!(config.contains("scene_statistics = true"), lamp.is_some(), "{config}");
-        let plan: toml::Value =
-            toml::from_str(&fs::read_to_string(out.join("plan.toml")).unwrap()).unwrap();
+        let plan: toml::Value = toml::from_str(&folder.text("run/plan.toml")).unwrap();
         let exponent = plan["lamp"]["exponent"].as_float().unwrap();
         assert!((exponent - 2.0).abs() < 0.5 && config.contains(&format!("exponent = {exponent}")));
     }
@@ -225,15 +202,14 @@ fn a_run_learns_the_lamp_that_was_found_and_none_where_there_is_none() {
 
 #[test]
 fn the_command_reports_the_lamp_as_text_json_and_page() {
-    let folder = written(&set(Some(16.0)), &Capture::default());
-    let (root, page) = (folder.path().display(), folder.path().join("page.html"));
-    let text = succeed(&format!("diagnose {root} -v --report {}", page.display()));
+    let folder = written(&set(Some(16.0)));
+    let text = folder.succeed("diagnose @ -v --report @page.html");
     assert!(text.lines().any(|line| line.starts_with("lamp ") && line.contains(" on ")), "{text}");
-    assert!(text.lines().next().unwrap().contains("lit by a lamp"), "{text}");
+    says(text.lines().next().unwrap(), &["lit by a lamp"]);
     let whole = unwrapped(&text);
     says(&whole, &["moves with the camera", "exponent", "beyond exposures", "by distance"]);
-    assert!(fs::read_to_string(page).unwrap().contains("moves with the camera"));
-    let json: Value = serde_json::from_str(&succeed(&format!("diagnose {root} --json"))).unwrap();
+    says(&folder.text("page.html"), &["moves with the camera"]);
+    let json = json(folder.succeed("diagnose @ --json"));
     let lamp = &json["scene"]["lamp"];
     for key in ["exponent", "ambient", "d_ref", "r_squared", "stops", "exposure_r_squared"] {
         assert!(lamp[key].is_f64(), "{key} of {lamp}");

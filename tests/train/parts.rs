@@ -10,31 +10,12 @@ use crate::common::command::{Folder, json, says};
 use crate::common::prelude::*;
 use crate::common::train::train;
 
-/// Six views of 40 x 30 pixels, with depth maps if requested.
-fn make_set(folder: &Path, with_depth: bool) {
-    let options = small_set(6, [40, 30], 1);
-    nightsplat_synth::write(folder, &options).unwrap();
-    if with_depth {
-        let depth = folder.join("depth");
-        fs::create_dir(&depth).unwrap();
-        // Half the size, as estimators return it; a plane that recedes upwards.
-        let map = Image::from_fn(20, 15, |x, y| [1.0 - (y as f32 + 0.1 * x as f32) / 20.0; 3]);
-        for file in fs::read_dir(folder.join("low")).unwrap() {
-            let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
-            map.save_png16(depth.join(format!("depth_{name}.png"))).unwrap();
-        }
-    }
-}
-
 fn config(parts: &[Part]) -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::Ap3);
     let mut config = TrainConfig { steps: 40, sh_degree: 0, tone, ..TrainConfig::bare() };
     config.schedule.densify_after = 10;
     config.schedule.densify_interval = 15;
-    config.model.set_parts(parts);
-    config.model.network.channels = 4;
-    config.model.network.stages = 2;
-    config.model.network.repeats = 2;
+    set_small_parts(&mut config, parts);
     config.model.rates.denoiser = 1e-2;
     config.model.rates.tonemapper = 1e-2;
     config.schedule.initial_rates[Attribute::Features] = 5e-2;
@@ -55,6 +36,14 @@ fn plain_set(config: &TrainConfig) -> Dataset {
 fn deep_set(config: &TrainConfig) -> Dataset {
     static SET: OnceLock<Folder> = OnceLock::new();
     load(SET.get_or_init(|| folder(true)), config)
+}
+
+/// Six views of 40 x 30 pixels, with depth maps if requested.
+fn make_set(set: &Path, with_depth: bool) {
+    if with_depth {
+        return crate::common::train::write_with_depth(set);
+    }
+    nightsplat_synth::write(set, &small_set(6, [40, 30], 1)).unwrap();
 }
 
 fn folder(with_depth: bool) -> Folder {
@@ -239,7 +228,7 @@ fn depth_maps_are_found_resized_negated_and_left_out_if_they_are_constant() {
 
     config.model.depth_folder = Some(folder.join("nowhere"));
     let error = Dataset::load(&folder, &config.load_options()).unwrap_err().to_string();
-    assert!(error.contains("nowhere") && error.contains("depth"), "{error}");
+    says(&error, &["nowhere", "depth"]);
 }
 
 /// Maps of half the size, as estimators return them, in OpenGL's axes; one of another shape, one without normals.

@@ -94,5 +94,5 @@ fn the_bits_are_an_ordinary_setting() {
         assert_eq!(TrainConfig::from_toml(&config.to_toml().unwrap()).unwrap(), config);
     }
     let message = with("precision.photographs=12").unwrap_err().to_string();
-    assert!(message.contains("precision.photographs is") && message.contains("exact"), "{message}");
+    says(&message, &["precision.photographs is", "exact"]);
 }

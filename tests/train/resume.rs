@@ -11,9 +11,8 @@ use crate::common::prelude::*;
 use crate::common::workspace::log;
 
 /// A dataset of nine small views.
-fn make_set(folder: &Path) {
-    let options = small_set(9, [40, 30], 2);
-    nightsplat_synth::write(folder, &options).unwrap();
+fn nine() -> Folder {
+    written(&small_set(9, [40, 30], 2))
 }
 
 /// Density control runs after steps 10 and 20 of thirty.
@@ -23,10 +22,7 @@ fn config(parts: &[Part]) -> TrainConfig {
     config.schedule.densify_after = 5;
     config.schedule.densify_interval = 10;
     config.schedule.sh_degree_interval = 8;
-    config.model.set_parts(parts);
-    config.model.network.channels = 4;
-    config.model.network.stages = 2;
-    config.model.network.repeats = 2;
+    set_small_parts(&mut config, parts);
     config.model.denoiser_crop = 16;
     config
 }
@@ -52,26 +48,21 @@ fn restored(new: impl Fn() -> Trainer, step: u64, folder: &Path) -> Trainer {
 
 #[test]
 fn a_restored_run_continues_bit_for_bit() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path());
+    let folder = nine();
     let gpu = gpu();
     for parts in [&[][..], &[Part::Denoiser, Part::Tonemapper, Part::Structure, Part::Lamp]] {
         let config = config(parts);
-        let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
+        let dataset = Dataset::load(&folder, &config.load_options()).unwrap();
         let new = || Trainer::new(&gpu, config.clone(), &dataset).unwrap();
-        let (expected, all) = finished(&mut new(), folder.path());
+        let (expected, all) = finished(&mut new(), &folder);
         // Between passes of density control, right after one, and before the first.
         for step in [17, 20, 3] {
-            let checkpoint = folder.path().join("checkpoint.safetensors");
-            let mut interrupted = new();
-            advance(&mut interrupted, step);
-            interrupted.save_checkpoint(&checkpoint).unwrap();
-            let mut restored = new();
+            let mut restored = restored(&new, step, &folder);
             // The trainer's previous state is discarded.
-            advance(&mut restored, 12);
-            restored.restore(&checkpoint).unwrap();
+            advance(&mut restored, step + 5);
+            restored.restore(&folder.join("checkpoint.safetensors")).unwrap();
             assert_eq!(restored.steps_done(), step);
-            let (end, reports) = finished(&mut restored, folder.path());
+            let (end, reports) = finished(&mut restored, &folder);
             assert!(end == expected, "{parts:?} from step {step}: another end");
             let same = reports.iter().zip(&all[step as usize..]);
             assert!(same.clone().all(|(a, b)| a.terms == b.terms && a.view == b.view));
@@ -83,10 +74,8 @@ fn a_restored_run_continues_bit_for_bit() {
 /// No gain is enough: both end at the first check.
 #[test]
 fn growth_and_the_sh_degree_stop_if_held_out_views_gain_too_little_and_stay_so_after_a_resume() {
-    let folder = tempfile::tempdir().unwrap();
     // Enough views to hold one out.
-    let options = small_set(12, [40, 30], 2);
-    nightsplat_synth::write(folder.path(), &options).unwrap();
+    let folder = written(&small_set(12, [40, 30], 2));
     let gpu = gpu();
     let mut free = config(&[]);
     free.schedule.densify_interval = 3;
@@ -94,36 +83,36 @@ fn growth_and_the_sh_degree_stop_if_held_out_views_gain_too_little_and_stay_so_a
     free.stop.views = 1;
     let mut ending = free.clone();
     (ending.stop.growth_gain, ending.stop.degree_gain) = (1e3, 1e3);
-    let dataset = Dataset::load(folder.path(), &free.load_options()).unwrap();
+    let dataset = Dataset::load(&folder, &free.load_options()).unwrap();
     let new = |config: &TrainConfig| Trainer::new(&gpu, config.clone(), &dataset).unwrap();
     let [mut freely, mut ended] = [new(&free), new(&ending)];
-    finished(&mut freely, folder.path());
+    finished(&mut freely, &folder);
     // Rounds after steps 6, 9, 12, 15 and 18; SH degree 1 is in use from step 8 to 15.
     advance(&mut ended, 18);
     let count = ended.gaussian_count();
-    let (expected, _) = finished(&mut ended, folder.path());
+    let (expected, _) = finished(&mut ended, &folder);
     assert!(ended.held_out_psnr().unwrap().is_some());
     let colors = |trainer: &Trainer| trainer.gaussians().unwrap().rest().to_vec();
     assert!(ended.gaussian_count() <= count && freely.gaussian_count() > count);
     assert!(colors(&ended).iter().all(|rest| *rest == Vec3::ZERO));
     assert!(colors(&freely).iter().any(|rest| *rest != Vec3::ZERO));
     for step in [13, 16, 20] {
-        let mut restored = restored(|| new(&ending), step, folder.path());
-        assert!(finished(&mut restored, folder.path()).0 == expected, "from step {step}");
+        let mut restored = restored(|| new(&ending), step, &folder);
+        assert!(finished(&mut restored, &folder).0 == expected, "from step {step}");
     }
 }
 
 /// A dataset with one held-out view, and a run on it that converges as early as possible: no gain is enough.
-fn early(folder: &Path) -> (Dataset, TrainConfig) {
-    let options = small_set(12, [40, 30], 2);
-    nightsplat_synth::write(folder, &options).unwrap();
+fn early() -> (Folder, Dataset, TrainConfig) {
+    let folder = written(&small_set(12, [40, 30], 2));
     let mut config = config(&[]);
     config.steps = 60;
     config.schedule.resolution_steps = [0, 0];
     (config.stop.views, config.stop.every, config.stop.gain) = (1, 7, 90.0);
     config.stop.detail_gain = 1.0;
     config.schedule.cooldown_steps = 9;
-    (Dataset::load(folder, &config.load_options()).unwrap(), config)
+    let dataset = Dataset::load(&folder, &config.load_options()).unwrap();
+    (folder, dataset, config)
 }
 
 fn ended(trainer: &mut Trainer, folder: &Path) -> Vec<u8> {
@@ -137,12 +126,11 @@ fn ended(trainer: &mut Trainer, folder: &Path) -> Vec<u8> {
 
 #[test]
 fn a_run_that_converges_settles_and_ends_and_so_does_one_that_is_killed_and_resumed() {
-    let folder = tempfile::tempdir().unwrap();
-    let (dataset, config) = early(folder.path());
+    let (folder, dataset, config) = early();
     let new = || Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
     let mut whole = new();
     assert!(whole.may_end_early());
-    let expected = ended(&mut whole, folder.path());
+    let expected = ended(&mut whole, &folder);
     // Rounds follow steps 10 and 20. A score that drops within ten steps of a round waits until they are over.
     let steps: Vec<u64> = whole.held_out_scores().map(|(step, _)| step).collect();
     assert_eq!(steps, [7, 20, 30, 39]);
@@ -158,8 +146,8 @@ fn a_run_that_converges_settles_and_ends_and_so_does_one_that_is_killed_and_resu
     assert_eq!((end.reason, end.step), (EndReason::Converged, 39));
     // During growth, after a score, at convergence, and while it settles.
     for step in [5, 20, 25, 30, 34] {
-        let mut restored = restored(new, step, folder.path());
-        assert!(ended(&mut restored, folder.path()) == expected, "from step {step}");
+        let mut restored = restored(new, step, &folder);
+        assert!(ended(&mut restored, &folder) == expected, "from step {step}");
         assert_eq!(restored.end().unwrap(), end);
     }
 }
@@ -168,11 +156,10 @@ fn a_run_that_converges_settles_and_ends_and_so_does_one_that_is_killed_and_resu
 /// cooldown has begun as planned.
 #[test]
 fn a_run_whose_end_is_requested_cools_down_from_there_and_so_does_one_that_is_killed_and_resumed() {
-    let folder = tempfile::tempdir().unwrap();
-    let (dataset, mut config) = early(folder.path());
+    let (folder, dataset, mut config) = early();
     // It does not converge before.
     config.stop.every = 1000;
-    let checkpoint = folder.path().join("checkpoint.safetensors");
+    let checkpoint = folder.join("checkpoint.safetensors");
     for (from, last, reason) in [
         (10, 19, EndReason::Requested),
         (17, 26, EndReason::Requested),
@@ -191,8 +178,8 @@ fn a_run_whose_end_is_requested_cools_down_from_there_and_so_does_one_that_is_ki
         let mut resumed = new();
         resumed.restore(&checkpoint).unwrap();
         resumed.finish();
-        let expected = ended(&mut whole, folder.path());
-        assert!(ended(&mut resumed, folder.path()) == expected, "from {from}");
+        let expected = ended(&mut whole, &folder);
+        assert!(ended(&mut resumed, &folder) == expected, "from {from}");
         let end = whole.end().unwrap();
         assert_eq!((end.reason, end.step), (reason, last));
         // Killed while it cools down: the checkpoint records the request.
@@ -203,7 +190,7 @@ fn a_run_whose_end_is_requested_cools_down_from_there_and_so_does_one_that_is_ki
         killed.save_checkpoint(&checkpoint).unwrap();
         let mut restored = new();
         restored.restore(&checkpoint).unwrap();
-        assert!(ended(&mut restored, folder.path()) == expected, "from {from}, killed");
+        assert!(ended(&mut restored, &folder) == expected, "from {from}, killed");
         assert_eq!(restored.end().unwrap(), end);
         // With more steps, the request is over.
         let mut longer =
@@ -215,23 +202,21 @@ fn a_run_whose_end_is_requested_cools_down_from_there_and_so_does_one_that_is_ki
 
 #[test]
 fn a_run_that_is_resumed_with_other_steps_runs_all_of_them() {
-    let folder = tempfile::tempdir().unwrap();
-    let (dataset, config) = early(folder.path());
-    let checkpoint = folder.path().join("end.safetensors");
-    ended(&mut Trainer::new(&gpu(), config.clone(), &dataset).unwrap(), folder.path());
+    let (folder, dataset, config) = early();
+    let checkpoint = folder.join("end.safetensors");
+    ended(&mut Trainer::new(&gpu(), config.clone(), &dataset).unwrap(), &folder);
     let longer = TrainConfig { steps: 48, ..config };
     let mut restored = Trainer::new(&gpu(), longer, &dataset).unwrap();
     restored.restore(&checkpoint).unwrap();
     assert_eq!((restored.last_step(), restored.may_end_early()), (48, false));
-    ended(&mut restored, folder.path());
+    ended(&mut restored, &folder);
     let end = restored.end().unwrap();
     assert_eq!((end.reason, end.step), (EndReason::Steps, 48));
 }
 
 #[test]
 fn held_out_views_that_show_nothing_are_not_scored() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut dataset, config) = early(folder.path());
+    let (_folder, mut dataset, config) = early();
     let held_out = |view: &&mut View| view.split == Split::HeldOut;
     let view = dataset.views.iter_mut().find(held_out).unwrap();
     (view.image, view.original) = (Some(Image::filled(40, 30, [0.0; 3])), None);
@@ -242,11 +227,10 @@ fn held_out_views_that_show_nothing_are_not_scored() {
 
 #[test]
 fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path());
-    let (gpu, path) = (gpu(), folder.path().join("checkpoint.safetensors"));
+    let folder = nine();
+    let (gpu, path) = (gpu(), folder.join("checkpoint.safetensors"));
     let config = config(&[]);
-    let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
+    let dataset = Dataset::load(&folder, &config.load_options()).unwrap();
     let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
     advance(&mut trainer, 6);
     trainer.save_checkpoint(&path).unwrap();
@@ -256,9 +240,7 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
     let refuses = |trainer: &mut Trainer, bytes: &[u8], parts: &[&str]| {
         fs::write(&path, bytes).unwrap();
         let message = trainer.restore(&path).unwrap_err().to_string();
-        for part in parts.iter().chain(&["checkpoint.safetensors"]) {
-            assert!(message.contains(part), "`{part}` is not in: {message}");
-        }
+        says(&message, &[parts, &["checkpoint.safetensors"]].concat());
     };
     let edited = |from: &str, to: &str| {
         assert_eq!(from.len(), to.len());
@@ -291,13 +273,12 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
 
 #[test]
 fn a_run_reports_every_event_to_its_observer_in_order() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(&folder.path().join("set"));
+    let folder = nine();
     let config = TrainConfig { eval_every: 12, checkpoint_every: 20, ..config(&[]) };
-    let dataset = Dataset::load(folder.path().join("set"), &config.load_options()).unwrap();
+    let dataset = Dataset::load(&folder, &config.load_options()).unwrap();
     let train = |config: &TrainConfig, if_exists| {
         let mut told = vec![];
-        let out = folder.path().join("run");
+        let out = folder.join("run");
         let trained = run::train(&gpu(), config, &dataset, &out, if_exists, |event| {
             told.push(match event {
                 Event::Started { step, steps, .. } => format!("started {step} of {steps}"),
@@ -334,19 +315,17 @@ fn a_run_reports_every_event_to_its_observer_in_order() {
 
 #[test]
 fn a_killed_run_is_resumed_to_the_same_model() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = |name: &str| folder.path().join(name);
-    make_set(&path("set"));
-    let set = path("set").display().to_string();
-    let train = |run: &PathBuf, options: &str| {
-        format!("train {set} --out {} --sh-degree 1 --checkpoint-every 10 {options}", run.display())
+    let workspace = Workspace::new();
+    let train = |run: &str, options: &str| {
+        let set = format!("train @set --out @{run} --sh-degree 1 --checkpoint-every 10");
+        workspace.named(&format!("{set} {options}"))
     };
-    let (straight, killed) = (path("straight"), path("killed"));
-    succeed(&train(&straight, "--steps 200"));
+    succeed(&train("straight", "--steps 200"));
 
     // Without a checkpoint it starts over; killed at some step after one, it resumes.
-    let mut child = command(&train(&killed, "--steps 200 --resume"));
+    let mut child = command(&train("killed", "--steps 200 --resume"));
     let mut child = child.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let killed = workspace.path("killed");
     let checkpoint = killed.join("checkpoint.safetensors");
     while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
         std::thread::sleep(Duration::from_millis(2));
@@ -354,22 +333,24 @@ fn a_killed_run_is_resumed_to_the_same_model() {
     child.kill().unwrap();
     child.wait().unwrap();
     assert!(!killed.join("metrics.json").exists(), "the run ended before it was killed");
-    succeed(&train(&killed, "--steps 200 --resume"));
-    let model = |run: &Path| fs::read(run.join("model.ply")).unwrap();
-    assert!(model(&killed) == model(&straight));
-    assert_eq!(log(&killed), log(&straight));
+    succeed(&train("killed", "--steps 200 --resume"));
+    assert!(workspace.model("killed") == workspace.model("straight"));
+    assert_eq!(log(&killed), log(&workspace.path("straight")));
 
     // A finished run is extended; the files of its previous end are replaced.
-    succeed(&train(&killed, "--steps 203 --resume"));
+    succeed(&train("killed", "--steps 203 --resume"));
     assert_eq!(log(&killed).len(), 204);
-    assert!(model(&killed) != model(&straight));
+    assert!(workspace.model("killed") != workspace.model("straight"));
 
-    refused(&train(&killed, "--steps 203 --resume --overwrite"), 2, &["--overwrite"]);
-    refused(&train(&killed, "--steps 300 --resume --seed 4"), 3, &["seed (--seed) = 10, not 4"]);
-    refused(&train(&killed, "--steps 199 --resume"), 3, &["at step 203", "raise steps"]);
-    fs::write(killed.join("train.csv"), "step,view\n1,000,1\n").unwrap();
-    refused(&train(&killed, "--steps 300 --resume"), 3, &["train.csv", "step 203"]);
+    let refused = |options: &str, code: i32, parts: &[&str]| {
+        refused(&train("killed", &format!("{options} --resume")), code, parts);
+    };
+    refused("--steps 203 --overwrite", 2, &["--overwrite"]);
+    refused("--steps 300 --seed 4", 3, &["seed (--seed) = 10, not 4"]);
+    refused("--steps 199", 3, &["at step 203", "raise steps"]);
+    workspace.write("killed/train.csv", "step,view\n1,000,1\n");
+    refused("--steps 300", 3, &["train.csv", "step 203"]);
     fs::remove_file(&checkpoint).unwrap();
     fs::remove_file(killed.join("checkpoint.before.safetensors")).unwrap();
-    refused(&train(&killed, "--steps 300 --resume"), 1, &["already contains a run", "--overwrite"]);
+    refused("--steps 300", 1, &["already contains a run", "--overwrite"]);
 }

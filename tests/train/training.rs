@@ -1,23 +1,15 @@
 //! Training end to end on a small synthetic set.
 
-use std::time::Duration;
-
-use glam::{DVec2, UVec2, Vec3};
 use nightsplat::Error;
-use nightsplat::gpu::testing::{gpu, gpu_with, recorded, submitted};
-use nightsplat::gpu::{DeviceChoice, Gpu};
+use nightsplat::gpu::DeviceChoice;
+use nightsplat::gpu::testing::{recorded, submitted};
 use nightsplat::results::eval::{self, After, Metric, ModelRenderer};
 use nightsplat::splats::densify::DensityControl;
 use nightsplat::splats::model::Model;
-use nightsplat::splats::packed_sh::StorageFormat;
-use nightsplat::train::{Background, StepReport, TrainConfig, Trainer};
-use nightsplat_models::gaussians::{Gaussians, Shape};
-use nightsplat_photographs::dataset::{Dataset, Split};
-use nightsplat_photographs::image::Image;
-use nightsplat_photographs::metrics::Scores;
-use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::train::{Background, StepReport};
 
-use crate::common::train::{advance, train};
+use crate::common::prelude::*;
+use crate::common::train::train;
 
 /// Ten views of 64 x 48 pixels.
 fn dataset() -> Dataset {
@@ -316,11 +308,10 @@ fn a_parameter_that_is_not_finite_ends_the_run_with_step_and_plane_and_reaches_n
         Trainer::new(&gpu(), config.clone(), &dataset).unwrap().gaussians().unwrap();
     gaussians.quats_mut()[7][2] = f32::NAN;
     let mut trainer = Trainer::from_gaussians(&gpu(), config, &dataset, &gaussians).unwrap();
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("checkpoint.safetensors");
-    let refused = trainer.save_checkpoint(&path).unwrap_err().to_string();
+    let folder = Folder::empty();
+    let refused = trainer.save_checkpoint(&folder.join("a.safetensors")).unwrap_err().to_string();
     assert!(refused.contains("step 0: number 7 of quats is not finite"), "{refused}");
-    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
     let error = loop {
         match trainer.advance(60) {
             Ok(reports) => {

@@ -4,10 +4,10 @@ use nightsplat_diagnose::Diagnosis;
 use nightsplat_photographs::dataset::LoadOptions;
 
 use super::synthetic::*;
-use crate::common::command::{json, run};
+use crate::common::command::json;
+use crate::common::paths;
 use crate::common::png::put_chunk;
 use crate::common::prelude::*;
-use crate::common::says;
 
 #[test]
 fn the_configuration_keeps_the_orientation() {
@@ -19,16 +19,14 @@ fn the_configuration_keeps_the_orientation() {
         jpeg(&root.join("images").join(&*name), SIZE, 3);
     }
     turned.write_text(&root.join("sparse/0"));
-    let diagnose = format!("diagnose {}", root.display());
-    assert!(run(&diagnose, 0).1.contains("--orientation exif"));
-    let (_, log) = run(&format!("{diagnose} --orientation exif"), 0);
+    says(&root.run("diagnose @", 0).1, &["--orientation exif"]);
+    let (_, log) = root.run("diagnose @ --orientation exif", 0);
     assert!(!log.contains("Exif"), "{log}");
-    let line = format!("train {} --out {}/run --explain", root.display(), root.display());
-    let (explained, _) = run(&format!("{line} --orientation exif"), 0);
+    let train = "train @ --out @run --explain --orientation";
+    let explained = root.succeed(&format!("{train} exif"));
     let kept = explained.lines().find(|line| line.contains("orientation")).unwrap();
     says(kept, &["exif", "--orientation"]);
-    let (_, refused) = run(&format!("{line} --orientation upright"), 2);
-    says(&refused, &["auto, stored, exif"]);
+    says(&root.run(&format!("{train} upright"), 2).1, &["auto, stored, exif"]);
 }
 
 #[test]
@@ -37,8 +35,7 @@ fn heic_is_refused_with_its_converter_and_listed_as_unread() {
     fs::write(root.join("a.heic"), b"\0\0\0\x18ftypheic\0\0\0\0mif1heic").unwrap();
     photograph(&root.join("b.png"), SIZE, 0.1);
     root.refused("tone apply @a.heic", 3, &["a.heic", "HEIC", "heif-convert", "sips"]);
-    let (_, message) = root.run("tone apply @", 0);
-    says(&message, &["not read: 1 .heic", "heif-convert"]);
+    says(&root.run("tone apply @", 0).1, &["not read: 1 .heic", "heif-convert"]);
 }
 
 #[test]
@@ -59,13 +56,12 @@ fn masked_pixels_are_not_in_the_statistics_of_tone() {
 #[test]
 fn a_profile_that_cannot_be_used_is_named_once_for_the_dataset() {
     let root = &Folder::lom();
-    for entry in fs::read_dir(root.join("low")).unwrap() {
-        put_chunk(&entry.unwrap().path(), b"iCCP", b"name\0\0damaged");
+    for path in paths(&root.join("low")) {
+        put_chunk(&path, b"iCCP", b"name\0\0damaged");
     }
-    let (_, message) = run(&format!("diagnose {}", root.display()), 0);
-    let lines: Vec<&str> =
-        message.lines().filter(|line| line.contains("a damaged ICC profile")).collect();
-    assert_eq!(lines.len(), 1, "{message}");
+    let (_, message) = root.run("diagnose @", 0);
+    let lines = message.lines().filter(|line| line.contains("a damaged ICC profile"));
+    assert_eq!(lines.count(), 1, "{message}");
 }
 
 #[test]

@@ -1,22 +1,16 @@
 //! `nightsplat pose`: external programs, their failures, and the written dataset; COLMAP itself if it is installed.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
-
-use nightsplat_photographs::dataset::Split;
-use nightsplat_photographs::image::{Image, ImageFile};
-
 use super::synthetic::*;
-use crate::common::command::{refused, run, succeed};
-use crate::common::train::small_set;
-use crate::common::{not_run, says, shared};
+use crate::common::command::{file_names, says};
+use crate::common::not_run;
+use crate::common::prelude::*;
 
-/// A program with the command line of COLMAP, and a few lines of shell for each of its commands.
-pub(super) fn stub(folder: &Path, cases: &str) -> PathBuf {
+/// A program `colmap-stub` with the command line of COLMAP, and a few lines of shell for each of its commands.
+pub(super) fn stub(folder: &Path, cases: &str) {
     let path = folder.join("colmap-stub");
     let lines = format!(
-        "command=$1; shift\n\
+        "root={}\n\
+         command=$1; shift\n\
          if [ \"$1\" = -h ]; then\n\
          [ $command = mapper ] && echo '  --Mapper.init_min_tri_angle arg (=16)'\n\
          exit 0\n\
@@ -34,38 +28,33 @@ pub(super) fn stub(folder: &Path, cases: &str) -> PathBuf {
          done\n\
          case $command in\n\
          {cases}\n\
-         esac\n"
+         esac\n",
+        folder.display()
     );
     script(&path, &lines);
-    path
 }
 
 /// A [`stub`] that lists learned features.
-pub(super) fn learned_stub(folder: &Path, cases: &str) -> PathBuf {
-    let path = stub(folder, cases);
+pub(super) fn learned_stub(folder: &Path, cases: &str) {
+    stub(folder, cases);
+    let path = folder.join("colmap-stub");
     let option = "  --AlikedExtraction.max_num_features arg (=2048)";
     let lines = fs::read_to_string(&path).unwrap();
     let help =
         format!("[ $command = feature_extractor ] && echo '{option}'\n[ $command = mapper ] &&");
     fs::write(&path, lines.replacen("[ $command = mapper ] &&", &help, 1)).unwrap();
-    path
 }
 
-/// The arguments of `nightsplat` for these photographs, the dataset to write and a program.
-pub(super) fn line(photos: &Path, out: &Path, colmap: &Path, more: &str) -> String {
-    let [photos, out, colmap] = [photos, out, colmap].map(Path::display);
-    format!("pose {photos} --out {out} --colmap {colmap} {more}")
+/// The command for `photos` with the stub, and these options.
+pub(super) fn pose(options: &str) -> String {
+    format!("pose @photos --out @scene --colmap @colmap-stub {options}")
 }
 
 /// The case of a stub that finds the models in `models`.
-pub(super) fn models(root: &Path) -> String {
-    format!("mapper) cp -r {}/models/* $output;;", root.display())
-}
+pub(super) const MODELS: &str = "mapper) cp -r $root/models/* $output;;";
 
 /// The case of a stub that keeps what it sees in `seen`, and finds nothing.
-fn seen(root: &Path) -> String {
-    format!("mapper) cp -r $images {}/seen; exit 1;;", root.display())
-}
+const SEEN: &str = "mapper) cp -r $images $root/seen; exit 1;;";
 
 /// A shell script with these lines.
 fn script(path: &Path, lines: &str) {
@@ -84,6 +73,12 @@ pub(super) fn photographed(root: &Path) -> PathBuf {
     photos
 }
 
+/// The mean of an image.
+pub(super) fn mean(path: &Path) -> f32 {
+    let data = Image::load(path).unwrap().data;
+    data.iter().sum::<f32>() / data.len() as f32
+}
+
 fn dark_picture(index: usize) -> Image {
     Image::from_fn(SIZE.0, SIZE.1, |x, y| {
         let value = 0.02 + 0.06 * f32::from((x / 3 + y / 4 + index as u32).is_multiple_of(2));
@@ -92,134 +87,108 @@ fn dark_picture(index: usize) -> Image {
 }
 
 /// A failed dataset leaves only its log.
-fn nothing_is_left(out: &Path) {
-    let beside: Vec<String> = fs::read_dir(out.parent().unwrap())
-        .unwrap()
-        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
-        .filter(|name| name.starts_with("scene") && name != "scene.colmap.log")
-        .collect();
+fn nothing_is_left(root: &Path) {
+    let mut beside = file_names(root);
+    beside.retain(|name| name.starts_with("scene") && name != "scene.colmap.log");
     assert!(beside.is_empty(), "{beside:?}");
 }
 
 #[test]
 fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
-    let folder = Folder::empty();
-    let root = &folder;
+    let root = &Folder::empty();
     let (photos, out) = (photographed(root), root.join("scene"));
     model(2).write_binary(&root.join("models/0"));
     model(8).write_binary(&root.join("models/1"));
-    let colmap = stub(
-        root,
-        &format!("mapper) cp -r {0}/models/* $output; cp -r $images {0}/seen;;", root.display()),
-    );
-    let arguments = line(&photos, &out, &colmap, "");
-    let (stdout, stderr) = run(&arguments, 0);
+    stub(root, "mapper) cp -r $root/models/* $output; cp -r $images $root/seen;;");
+    let (stdout, stderr) = root.run(&pose(""), 0);
     says(&stdout, &["8 of 9 photographs", "nightsplat train"]);
-    says(
-        &stderr,
-        &["9 photographs brightened", "features extracted", "features matched", "cameras placed"],
-    );
+    let stages =
+        ["9 photographs brightened", "features extracted", "features matched", "cameras placed"];
+    says(&stderr, &stages);
     for index in 0..8 {
         let file = name(index) + ".png";
         let [dark, kept] =
             [&photos, &out.join("images")].map(|folder| fs::read(folder.join(&file)).unwrap());
         assert_eq!(dark, kept, "{file}");
-        let mean = |folder: &Path| {
-            let data = Image::load(folder.join(&file)).unwrap().data;
-            data.iter().sum::<f32>() / data.len() as f32
-        };
-        assert!(mean(&root.join("seen")) > 4.0 * mean(&photos), "COLMAP sees {file} in the dark");
+        assert!(
+            mean(&root.join("seen").join(&file)) > 4.0 * mean(&photos.join(&file)),
+            "COLMAP sees {file} in the dark"
+        );
     }
     assert!(!out.join("images/v08.png").exists() && !out.join("work").exists());
-    assert!(fs::read_to_string(out.join("colmap.log")).unwrap().contains("$ "));
+    says(&root.text("scene/colmap.log"), &["$ "]);
     let dataset = load(&out);
     assert_eq!((dataset.views.len(), dataset.points.len()), (8, 20));
     // An existing folder is kept, unless `pose` wrote it and may replace it.
-    refused(&arguments, 1, &["scene", "exists already", "--overwrite"]);
-    succeed(&format!("{arguments} --overwrite"));
+    root.refused(&pose(""), 1, &["scene", "exists already", "--overwrite"]);
+    root.succeed(&pose("--overwrite"));
     fs::remove_file(out.join("colmap.log")).unwrap();
-    refused(&format!("{arguments} --overwrite"), 1, &["exists already; choose another folder"]);
+    root.refused(&pose("--overwrite"), 1, &["exists already; choose another folder"]);
 }
 
 /// One photograph in nine has no camera, so all are matched again.
 #[test]
 fn a_failed_second_matching_keeps_the_cameras_of_the_first() {
     let root = &Folder::empty();
-    let (photos, out) = (photographed(root), root.join("scene"));
+    photographed(root);
     model(8).write_binary(&root.join("models/0"));
-    let once = root.join("once");
-    let first = format!("touch {0}; cp -r {1}/models/* $output", once.display(), root.display());
-    let colmap = stub(root, &format!("mapper) [ -e {} ] && exit 9; {first};;", once.display()));
-    let arguments = line(&photos, &out, &colmap, "");
-    let (stdout, stderr) = run(&arguments, 0);
-    assert!(stdout.contains("8 of 9 photographs"), "{stdout}");
-    assert!(stderr.contains("using the cameras found so far"), "{stderr}");
+    let once = "[ -e $root/once ] && exit 9; touch $root/once; cp -r $root/models/* $output";
+    stub(root, &format!("mapper) {once};;"));
+    let (stdout, stderr) = root.run(&pose(""), 0);
+    says(&stdout, &["8 of 9 photographs"]);
+    says(&stderr, &["using the cameras found so far"]);
 }
 
 #[test]
 fn cameras_are_registered_globally_by_colmap_or_else_by_glomap() {
     let root = &Folder::empty();
-    let photos = photographed(root);
+    photographed(root);
     model(8).write_binary(&root.join("models/0"));
-    let models = format!("cp -r {}/models/* $output", root.display());
-    let pose = |out: &str, colmap: &Path, glomap: &str| {
-        line(&photos, &root.join(out), colmap, &format!("--mapper global --glomap {glomap}"))
+    let globally = |out: &str, glomap: &str| {
+        pose(&format!("--mapper global --glomap {glomap}")).replace("@scene", out)
     };
     // COLMAP has this command from 4.0 on.
-    let new = stub(root, &format!("help) echo global_mapper;;\nglobal_mapper) {models};;"));
-    let (stdout, _) = run(&pose("new", &new, "/nowhere/glomap"), 0);
-    assert!(stdout.contains("8 of 9 photographs"), "{stdout}");
-    let log = fs::read_to_string(root.join("new/colmap.log")).unwrap();
+    stub(root, "help) echo global_mapper;;\nglobal_mapper) cp -r $root/models/* $output;;");
+    says(&root.succeed(&globally("@new", "/nowhere/glomap")), &["8 of 9 photographs"]);
+    let log = root.text("new/colmap.log");
     let calibrated = log.find(" view_graph_calibrator --database_path").unwrap();
     assert!(log.find(" global_mapper --database_path").unwrap() > calibrated, "{log}");
 
-    fs::rename(stub(root, &format!("mapper) {models};;")), root.join("glomap")).unwrap();
-    let old = stub(root, "mapper) exit 9;;");
-    let glomap = root.join("glomap");
-    succeed(&pose("old", &old, glomap.to_str().unwrap()));
+    stub(root, MODELS);
+    fs::rename(root.join("colmap-stub"), root.join("glomap")).unwrap();
+    stub(root, "mapper) exit 9;;");
+    root.succeed(&globally("@old", "@glomap"));
     assert_eq!(load(&root.join("old")).views.len(), 8);
-    refused(
-        &pose("none", &old, "/nowhere/glomap"),
-        2,
-        &["`/nowhere/glomap` is not found", "COLMAP 4.0", "--glomap PATH"],
-    );
+    let parts = ["`/nowhere/glomap` is not found", "COLMAP 4.0", "--glomap PATH"];
+    root.refused(&globally("@none", "/nowhere/glomap"), 2, &parts);
     assert!(!root.join("none").exists());
-    let lost = stub(
-        root,
-        "help) echo global_mapper;;\nglobal_mapper) echo 'failed to create sparse model'; exit 1;;",
-    );
-    let (_, stderr) = run(&pose("none", &lost, "glomap"), 3);
-    assert!(stderr.contains("no cameras for these 9 photographs"), "{stderr}");
+    let lost = "global_mapper) echo 'failed to create sparse model'; exit 1;;";
+    stub(root, &format!("help) echo global_mapper;;\n{lost}"));
+    let (_, stderr) = root.run(&globally("@none", "glomap"), 3);
+    says(&stderr, &["no cameras for these 9 photographs"]);
 }
 
 #[test]
 fn a_failure_of_colmap_is_reported_in_a_line_and_leaves_no_dataset() {
     let root = &Folder::empty();
-    let (photos, out) = (photographed(root), root.join("scene"));
+    photographed(root);
     model(2).write_binary(&root.join("models/0"));
-    let two = models(root);
+    let pair = "mapper) echo 'E0 => No good initial image pair found'; exit 1;;";
+    let fails = "feature_extractor) echo first; echo; echo no such camera >&2; exit 3;;";
     for (cases, parts) in [
-        (
-            "feature_extractor) echo first; echo; echo no such camera >&2; exit 3;;",
-            &["feature_extractor ended with", "3: no such camera"][..],
-        ),
-        (
-            "exhaustive_matcher) kill -9 $$;;",
-            &["exhaustive_matcher ended with signal: 9", "no output"],
-        ),
-        (two.as_str(), &["no cameras for these 9 photographs", "scene.colmap.log"]),
-        (
-            "mapper) echo 'E0 => No good initial image pair found'; exit 1;;",
-            &["no cameras for these 9"],
-        ),
+        (fails, &["feature_extractor ended with", "3: no such camera"][..]),
+        ("exhaustive_matcher) kill -9 $$;;", &["_matcher ended with signal: 9", "no output"]),
+        (MODELS, &["no cameras for these 9 photographs", "scene.colmap.log"]),
+        (pair, &["no cameras for these 9"]),
         ("mapper) echo broken; exit 1;;", &["mapper ended with", "broken"]),
     ] {
-        let (_, stderr) = run(&line(&photos, &out, &stub(root, cases), ""), 3);
+        stub(root, cases);
+        let (_, stderr) = root.run(&pose(""), 3);
         let errors: Vec<&str> = stderr.lines().filter(|line| line.starts_with("error: ")).collect();
         assert_eq!(errors.len(), 1, "{stderr}");
-        assert!(parts.iter().all(|part| errors[0].contains(part)), "{stderr}");
+        says(errors[0], parts);
         assert!(root.join("scene.colmap.log").is_file());
-        nothing_is_left(&out);
+        nothing_is_left(root);
     }
 }
 
@@ -238,8 +207,8 @@ fn colmap_gets_the_focal_length_of_the_exif() {
         let turned = [&jpeg[..2], &segment, &jpeg[2..]].concat();
         fs::write(photos.join(format!("{index}.JPG")), turned).unwrap();
     }
-    let colmap = stub(root, &seen(root));
-    run(&line(&photos, &root.join("scene"), &colmap, ""), 3);
+    stub(root, SEEN);
+    root.run(&pose(""), 3);
     for index in 0..3 {
         let seen = fs::read(root.join(format!("seen/{index}.JPG"))).unwrap();
         let focal = b"\xa4\x05\0\x03\0\0\0\x01\0\x1c";
@@ -255,48 +224,35 @@ fn colmap_gets_the_focal_length_of_the_exif() {
 #[test]
 fn problems_before_the_start_are_reported_in_a_line() {
     let root = &Folder::empty();
-    let (photos, out) = (photographed(root), root.join("scene"));
-    let train = format!("train {} --out {}", photos.display(), root.join("run").display());
-    refused(&train, 3, &["9 photographs", "nightsplat pose", "--out DATASET"]);
+    let photos = photographed(root);
     fs::create_dir(root.join("empty")).unwrap();
-    fs::write(root.join("clip.mp4"), "no clip").unwrap();
-    fs::write(root.join("no.mp4"), "").unwrap();
+    root.write("clip.mp4", "no clip");
+    root.write("no.mp4", "");
     fs::create_dir(root.join("twice")).unwrap();
     for copy in ["twice/v00.png", "twice/v00.webp", "twice/v01.png"] {
         fs::copy(photos.join("v01.png"), root.join(copy)).unwrap();
     }
     (0..9).for_each(|i| photograph(&root.join(format!("black/{}.png", name(i))), SIZE, 0.0));
-    let absent = "`/nowhere/colmap` is not found";
-    let remedies = [absent, "apt install colmap", "brew install", "--colmap PATH"];
-    let absent = line(&photos, &out, "/nowhere/colmap".as_ref(), "");
-    refused(&absent, 2, &remedies);
-    assert!(run(&absent, 2).1.len() < 240, "a short line");
-    refused(&format!("{absent} --patience -1"), 2, &["--patience"]);
-    let ffmpeg = "--ffmpeg /nowhere/ffmpeg";
-    let cases: [(&str, &str, i32, &[&str]); 8] = [
-        ("absent", "", 3, &["absent", "cannot be read"]),
-        ("empty", "", 3, &["contains 0 photographs"]),
-        ("photos", "--fps 0", 2, &["--fps"]),
-        ("clip.mp4", ffmpeg, 2, &["`/nowhere/ffmpeg` is", "apt install ffmpeg", "--ffmpeg PATH"]),
-        (
-            "clip.mp4",
-            "--ffmpeg false",
-            3,
-            &["clip.mp4: is no clip", "false", "ended with", "pass a clip"],
-        ),
-        (
-            "no.mp4",
-            "--ffmpeg false",
-            3,
-            &["no.mp4: is no clip", "the file is empty", "pass a clip"],
-        ),
-        ("twice", "", 3, &["v00.png and v00.webp have the same name"]),
-        ("black", "", 3, &["/black", "black"]),
-    ];
-    for (photos, more, code, parts) in cases {
-        refused(&line(&root.join(photos), &out, "true".as_ref(), more), code, parts);
-    }
-    nothing_is_left(&out);
+    let absent = "pose @photos --out @scene --colmap /nowhere/colmap";
+    let remedies =
+        ["`/nowhere/colmap` is not found", "apt install colmap", "brew install", "--colmap PATH"];
+    root.refused(absent, 2, &remedies);
+    assert!(root.run(absent, 2).1.len() < 240, "a short line");
+    let ffmpeg = "`/nowhere/ffmpeg` is & apt install ffmpeg & --ffmpeg PATH";
+    let of_true = "--out @scene --colmap true";
+    root.refuses_all(&format!(
+        "3 | train @photos --out @run | 9 photographs & nightsplat pose & --out DATASET
+         2 | {absent} --patience -1 | --patience
+         3 | pose @absent {of_true} | absent & cannot be read
+         3 | pose @empty {of_true} | contains 0 photographs
+         2 | pose @photos {of_true} --fps 0 | --fps
+         2 | pose @clip.mp4 {of_true} --ffmpeg /nowhere/ffmpeg | {ffmpeg}
+         3 | pose @clip.mp4 {of_true} --ffmpeg false | clip.mp4: is no clip & false & ended with & pass a clip
+         3 | pose @no.mp4 {of_true} --ffmpeg false | no.mp4: is no clip & the file is empty & pass a clip
+         3 | pose @twice {of_true} | v00.png and v00.webp have the same name
+         3 | pose @black {of_true} | /black & black"
+    ));
+    nothing_is_left(root);
 }
 
 /// Whether an external program is installed; prints a line if not.
@@ -330,21 +286,12 @@ fn the_sharpest_frame_of_each_window_of_a_clip_is_used() {
         .output()
         .unwrap();
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-    let colmap = stub(root, &seen(root));
-    let (clip, out) = (root.join("clip.mkv"), root.join("scene"));
-    let arguments = line(&clip, &out, &colmap, "--fps 2");
-    let (_, stderr) = run(&arguments, 3);
-    assert!(stderr.contains("4 photographs brightened"), "{stderr}");
-    let mut seen: Vec<String> = fs::read_dir(root.join("seen"))
-        .unwrap()
-        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
-        .collect();
-    seen.sort();
-    assert_eq!(
-        seen,
-        ["frame_000003.png", "frame_000007.png", "frame_000011.png", "frame_000015.png"]
-    );
-    nothing_is_left(&out);
+    stub(root, SEEN);
+    let (_, stderr) = root.run(&pose("--fps 2").replace("@photos", "@clip.mkv"), 3);
+    says(&stderr, &["4 photographs brightened"]);
+    let seen = [3, 7, 11, 15].map(|frame| format!("frame_{frame:06}.png"));
+    assert_eq!(file_names(root.join("seen")), seen);
+    nothing_is_left(root);
 }
 
 /// A clip of one dark image, made by ffmpeg with these filters and options; `None` if this ffmpeg cannot.
@@ -370,15 +317,14 @@ fn hdr_and_wide_gamut_clips_give_the_frames_of_an_sdr_clip() {
         return;
     }
     let root = &Folder::empty();
-    let colmap = stub(root, &seen(root));
+    stub(root, SEEN);
     let seen = |clip: &Path| {
-        let out = root.join("scene");
-        let arguments = line(clip, &out, &colmap, "--fps 2");
-        let (_, stderr) = run(&arguments, 3);
+        let arguments = pose("--fps 2").replace("@photos", clip.to_str().unwrap());
+        let (_, stderr) = root.run(&arguments, 3);
         let frame = fs::read_dir(root.join("seen")).unwrap().next().unwrap().unwrap().path();
         let frame = Image::load(frame);
         fs::remove_dir_all(root.join("seen")).unwrap();
-        nothing_is_left(&out);
+        nothing_is_left(root);
         (frame.unwrap(), stderr)
     };
     let plain = clip_of(root, "plain.mkv", "null", &[]).unwrap();
@@ -413,15 +359,11 @@ fn without_the_hdr_filters_of_ffmpeg_the_error_has_the_command() {
     let copy = format!("for last; do :; done; cp {}/source.png $(printf $last 1)", root.display());
     script(&root.join("ffmpeg"), &copy);
     script(&root.join("ffprobe"), "echo arib-std-b67");
-    fs::write(root.join("clip.mov"), "a clip").unwrap();
-    let [clip, out, ffmpeg] = ["clip.mov", "scene", "ffmpeg"].map(|name| root.join(name));
-    let more = format!("--ffmpeg {}", ffmpeg.display());
-    let arguments = line(&clip, &out, "true".as_ref(), &more);
-    let parts = ["clip.mov: is HDR (HLG)", "zscale=t=linear", "sdr.mp4"];
-    refused(&arguments, 3, &parts);
+    root.write("clip.mov", "a clip");
+    let arguments = "pose @clip.mov --out @scene --colmap true --ffmpeg @ffmpeg";
+    root.refused(arguments, 3, &["clip.mov: is HDR (HLG)", "zscale=t=linear", "sdr.mp4"]);
     script(&root.join("ffprobe"), "exit 1");
-    let (_, message) = run(&arguments, 3);
-    says(&message, &["ffprobe", "assuming SDR"]);
+    says(&root.run(arguments, 3).1, &["ffprobe", "assuming SDR"]);
 }
 
 /// Burns a line of text into the last rows of photographs of 200x150; its end changes.
@@ -449,19 +391,14 @@ fn colmap_finds_the_cameras_of_a_dark_set_with_a_date_burnt_into_it() {
         return;
     }
     let root = &Folder::empty();
-    let options = small_set(20, [200, 150], 3);
-    nightsplat_synth::write(root.join("set"), &options).unwrap();
-    let photos = root.join("set/low");
-    burn_in_text(&photos);
-    let out = root.join("scene");
-    succeed(&format!("pose {} --out {}", photos.display(), out.display()));
-    let (truth, found) = (load(&root.join("set")), load(&out));
+    nightsplat_synth::write(root.join("set"), &small_set(20, [200, 150], 3)).unwrap();
+    burn_in_text(&root.join("set/low"));
+    root.succeed("pose @set/low --out @scene");
+    let (truth, found) = (load(&root.join("set")), load(&root.join("scene")));
     assert!(found.views.len() >= 15, "{} of 20", found.views.len());
     assert!(found.points.len() > 50, "{} points", found.points.len());
     // Distances between cameras, whose scale is free.
-    let center = |name: &str, set: &nightsplat_photographs::dataset::Dataset| {
-        view(set, name).camera.center()
-    };
+    let center = |name: &str, set: &Dataset| view(set, name).camera.center();
     let names: Vec<&str> = found.views.iter().map(|view| view.name.as_str()).collect();
     let spans = names.windows(3).map(|three| {
         let span = |set| center(three[0], set).distance(center(three[2], set));
@@ -480,21 +417,18 @@ fn real_dark_photographs_train_as_well_with_cameras_from_colmap_as_with_supplied
         return;
     }
     let folder = Folder::empty();
-    let [scene, found, given] =
-        ["scene", "found", "given"].map(|name| folder.join(name).display().to_string());
-    let chair = chair.display().to_string();
-    succeed(&format!("pose {chair}/low --out {scene}"));
-    assert_eq!(load(scene.as_ref()).views.len(), 48);
-    let held_out = names(&load(chair.as_ref()), Split::Test).join("\n");
-    fs::write(format!("{scene}/test.txt"), held_out).unwrap();
-    let trained = |set: String, out: &str| {
-        succeed(&format!("train {set} --downscale 4 --steps 1000 --seed 1 --out {out}"));
-        let metrics = fs::read(format!("{out}/metrics.json")).unwrap();
-        let metrics: serde_json::Value = serde_json::from_slice(&metrics).unwrap();
-        metrics["mean"]["psnr"].as_f64().unwrap()
+    let held_out = names(&load(&chair), Split::Test).join("\n");
+    let chair = chair.display();
+    folder.succeed(&format!("pose {chair}/low --out @scene"));
+    assert_eq!(load(&folder.join("scene")).views.len(), 48);
+    folder.write("scene/test.txt", held_out);
+    let trained = |set: &str, out: &str| {
+        let options = "--downscale 4 --steps 1000 --seed 1";
+        folder.succeed(&format!("train {set} {options} --out @{out}"));
+        folder.json(&format!("{out}/metrics.json"))["mean"]["psnr"].as_f64().unwrap()
     };
-    let found = trained(format!("{scene} --reference {chair}/high"), &found);
-    let given = trained(chair, &given);
+    let found = trained(&format!("@scene --reference {chair}/high"), "found");
+    let given = trained(&chair.to_string(), "given");
     println!("{found:.2} dB with the cameras that COLMAP finds, {given:.2} dB with those supplied");
     assert!(found > given - 0.3);
 }

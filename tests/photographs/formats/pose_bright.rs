@@ -1,14 +1,9 @@
 //! `nightsplat pose --with`: dark photographs posed through bright ones of the same scene.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-
-use nightsplat_photographs::image::{Image, ImageFile};
-
-use super::pose::{is_installed, line, photographed, stub};
+use super::pose::{is_installed, mean, photographed, pose, stub};
 use super::synthetic::*;
-use crate::common::command::{refused, run, succeed};
-use crate::common::train::small_set;
+use crate::common::command::says;
+use crate::common::prelude::*;
 
 /// Bright photographs `day/v00.png` to `day/v03.png`: names of dark photographs, too.
 fn bright(root: &Path) -> PathBuf {
@@ -41,22 +36,14 @@ fn the_dark_and_the_bright_photographs_get_a_dataset_each_in_the_same_coordinate
     let mut others = model(9);
     others.images.iter_mut().for_each(|(_, _, _, name)| *name = format!("bright/{name}"));
     others.write_binary(&root.join("models/1"));
-    let cases =
-        format!("mapper) cp -r {0}/models/* $output; cp -r $images {0}/seen;;", root.display());
-    let colmap = stub(root, &cases);
-    let with = format!("--with {}", day.display());
-    let (stdout, stderr) = run(&line(&photos, &out, &colmap, &with), 0);
-    assert!(stdout.contains("5 of 9 photographs and 3 of 4 bright ones"), "{stdout}");
-    assert!(stderr.contains("4 bright photographs beside them"), "{stderr}");
+    stub(root, "mapper) cp -r $root/models/* $output; cp -r $images $root/seen;;");
+    let (stdout, stderr) = root.run(&pose("--with @day"), 0);
+    says(&stdout, &["5 of 9 photographs and 3 of 4 bright ones"]);
     let unplaced =
         "4 photographs have no camera and are left out: v05.png, v06.png, v07.png, v08.png";
-    assert!(stderr.contains(unplaced), "{stderr}");
-    let mean = |path: PathBuf| {
-        let data = Image::load(path).unwrap().data;
-        data.iter().sum::<f32>() / data.len() as f32
-    };
-    assert!(mean(root.join("seen/v00.png")) > 4.0 * mean(photos.join("v00.png")));
-    let unchanged = mean(root.join("seen/bright/v00.png")) / mean(day.join("v00.png"));
+    says(&stderr, &["4 bright photographs beside them", unplaced]);
+    assert!(mean(&root.join("seen/v00.png")) > 4.0 * mean(&photos.join("v00.png")));
+    let unchanged = mean(&root.join("seen/bright/v00.png")) / mean(&day.join("v00.png"));
     assert!((unchanged - 1.0).abs() < 0.01, "normal light stays as it is: {unchanged}");
 
     let whole = model(8);
@@ -79,18 +66,16 @@ fn the_dark_and_the_bright_photographs_get_a_dataset_each_in_the_same_coordinate
 
 #[test]
 fn a_folder_that_cannot_pose_the_dark_photographs_is_refused() {
-    let folder = Folder::empty();
-    let root = &folder;
-    let (photos, day, out) = (photographed(root), bright(root), root.join("scene"));
-    let colmap = stub(root, "mapper) exit 0;;");
-    let pose = |with: &Path, more: &str| {
-        line(&photos, &out, &colmap, &format!("--with {} {more}", with.display()))
-    };
-    refused(&pose(&photos, ""), 3, &["photos", "is the folder of the dark photographs itself"]);
-    refused(&pose(&root.join("none"), ""), 3, &["none"]);
-    refused(&pose(&day, "--matcher sequential"), 2, &["--matcher sequential", "take exhaustive"]);
-    let (_, stderr) = run(&pose(&day, ""), 3);
-    assert!(stderr.contains("found no cameras for these 9 photographs"), "{stderr}");
+    let root = &Folder::empty();
+    photographed(root);
+    bright(root);
+    stub(root, "mapper) exit 0;;");
+    let itself = ["photos", "is the folder of the dark photographs itself"];
+    root.refused(&pose("--with @photos"), 3, &itself);
+    root.refused(&pose("--with @none"), 3, &["none"]);
+    let sequential = pose("--with @day --matcher sequential");
+    root.refused(&sequential, 2, &["--matcher sequential", "take exhaustive"]);
+    says(&root.run(&pose("--with @day"), 3).1, &["found no cameras for these 9 photographs"]);
 }
 
 #[test]
@@ -108,16 +93,12 @@ fn colmap_poses_dark_photographs_through_bright_ones_of_other_views() {
         let file = format!("{index:03}.png");
         fs::copy(root.join("set").join(from).join(&file), root.join(to).join(&file)).unwrap();
     }
-    let [night, day, out] =
-        ["night", "day", "scene"].map(|name| root.join(name).display().to_string());
-    succeed(&format!("pose {night} --with {day} --out {out}"));
+    root.succeed("pose @night --with @day --out @scene");
     let (truth, dark, bright) =
         (load(&root.join("set")), load(&root.join("scene")), load(&root.join("scene/bright")));
     assert!(dark.views.len() >= 3 && bright.views.len() >= 15, "{} dark", dark.views.len());
     // Distances of every dark camera from the bright ones, whose scale is free.
-    let center = |set: &nightsplat_photographs::dataset::Dataset, name: &str| {
-        view(set, name).camera.center()
-    };
+    let center = |set: &Dataset, name: &str| view(set, name).camera.center();
     let mut distances = vec![];
     for dark_view in &dark.views {
         for bright_view in &bright.views {

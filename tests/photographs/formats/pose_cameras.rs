@@ -1,14 +1,9 @@
 //! `nightsplat pose`: photographs that share a camera, photographs left out, and repeated runs of COLMAP.
 
-use std::collections::BTreeSet;
-use std::fs;
-use std::path::Path;
-
-use nightsplat_photographs::image::{Image, ImageFile};
-
-use super::pose::{learned_stub, line, models, photographed, stub};
+use super::pose::{MODELS, learned_stub, photographed, pose, stub};
 use super::synthetic::*;
-use crate::common::command::{refused, run, says};
+use crate::common::command::says;
+use crate::common::prelude::*;
 
 /// Copies a photograph and sets its equivalent focal length in Exif.
 fn taken_at(path: &Path, focal: u8) {
@@ -35,13 +30,9 @@ fn photographs_of_one_size_lens_and_focal_length_share_a_camera() {
     }
     photograph(&photos.join("other.png"), SIZE, 0.05);
     photograph(&photos.join("another.png"), (32, 20), 0.05);
-    let lists = root.join("lists");
-    let cases =
-        format!("feature_extractor) {{ tr '\\n' ' ' < $list; echo; }} >> {};;", lists.display());
-    let colmap = stub(root, &cases);
-    let (_, stderr) = run(&line(&photos, &root.join("scene"), &colmap, ""), 3);
-    assert!(stderr.contains("3 groups of photographs by size, lens and focal length"), "{stderr}");
-    let lists = fs::read_to_string(lists).unwrap();
+    stub(root, "feature_extractor) { tr '\\n' ' ' < $list; echo; } >> $root/lists;;");
+    says(&root.run(&pose(""), 3).1, &["3 groups of photographs by size, lens and focal length"]);
+    let lists = root.text("lists");
     let lists: BTreeSet<&str> = lists.lines().map(str::trim).collect();
     let expected = ["0.jpg 2.jpg 4.jpg", "1.jpg 3.jpg 5.jpg", "another.png other.png"];
     assert_eq!(lists, BTreeSet::from(expected));
@@ -50,18 +41,17 @@ fn photographs_of_one_size_lens_and_focal_length_share_a_camera() {
 #[test]
 fn a_photograph_that_does_not_decode_is_left_out_and_hidden_files_are_ignored() {
     let root = &Folder::empty();
-    let (photos, out) = (photographed(root), root.join("scene"));
-    fs::write(photos.join("broken.jpg"), "no photograph").unwrap();
-    fs::write(photos.join("._v00.png"), "Mac OS X").unwrap();
+    let photos = photographed(root);
+    root.write("photos/broken.jpg", "no photograph");
+    root.write("photos/._v00.png", "Mac OS X");
     photograph(&photos.join("dynamic_mask_v01.png"), SIZE, 1.0);
     model(9).write_binary(&root.join("models/0"));
-    let colmap = stub(root, &models(root));
-    let arguments = line(&photos, &out, &colmap, "");
-    let (stdout, stderr) = run(&arguments, 0);
-    assert!(stdout.contains("9 of 9 photographs with their cameras, one calibrated"), "{stdout}");
+    stub(root, MODELS);
+    let (stdout, stderr) = root.run(&pose(""), 0);
+    says(&stdout, &["9 of 9 photographs with their cameras, one calibrated"]);
     says(&stderr, &["left out: ", "broken.jpg"]);
     assert!(!stderr.contains("._v00"), "{stderr}");
-    let dataset = load(&out);
+    let dataset = load(&root.join("scene"));
     let masked: Vec<bool> = dataset.views.iter().map(|view| view.mask.is_some()).collect();
     // All of it is masked, so nothing is left to train on.
     assert_eq!((dataset.views.len(), masked.contains(&true)), (8, false));
@@ -70,52 +60,43 @@ fn a_photograph_that_does_not_decode_is_left_out_and_hidden_files_are_ignored() 
 #[test]
 fn an_implausible_calibration_is_reported() {
     let root = &Folder::empty();
-    let photos = photographed(root);
-    for (out, fy, is_plausible) in [("good", 36.0, true), ("bad", 60.0, false)] {
+    photographed(root);
+    stub(root, MODELS);
+    let posed = |fy: f64, code: i32| {
         let cameras = vec![(3, "PINHOLE", 1, vec![35.0, fy, 20.0, 15.0])];
         Model { cameras, ..model(9) }.write_binary(&root.join("models/0"));
-        let colmap = stub(root, &models(root));
-        let out = root.join(out);
-        let arguments = line(&photos, &out, &colmap, "");
-        let (stdout, stderr) = run(&arguments, 0);
-        assert_eq!(
-            stderr.contains("is implausible: its focal lengths are 71 % apart"),
-            !is_plausible,
-            "{stderr}"
-        );
-        assert!(stdout.contains("40x30 with focal length 35"), "{stdout}");
+        root.run(&pose("--overwrite"), code)
+    };
+    for (fy, is_plausible) in [(36.0, true), (60.0, false)] {
+        let (stdout, stderr) = posed(fy, 0);
+        let warned = stderr.contains("is implausible: its focal lengths are 71 % apart");
+        assert_eq!(warned, !is_plausible, "{stderr}");
+        says(&stdout, &["40x30 with focal length 35"]);
     }
-    let cameras = vec![(3, "PINHOLE", 1, vec![35.0, 93.0, 20.0, 15.0])];
-    Model { cameras, ..model(9) }.write_binary(&root.join("models/0"));
-    let arguments = line(&photos, &root.join("none"), &stub(root, &models(root)), "");
-    let (_, stderr) = run(&arguments, 3);
+    fs::remove_dir_all(root.join("scene")).unwrap();
+    let (_, stderr) = posed(93.0, 3);
     let error = stderr.lines().find(|line| line.starts_with("error: ")).unwrap();
-    says(
-        &error,
-        &[
-            "photos: COLMAP's calibration cannot be, 40x30 with focal length 35 x 93",
-            "2.7 times",
-            "--camera-model",
-        ],
-    );
-    assert!(!root.join("none").exists() && root.join("none.colmap.log").is_file());
+    let cannot_be = "photos: COLMAP's calibration cannot be, 40x30 with focal length 35 x 93";
+    says(error, &[cannot_be, "2.7 times", "--camera-model"]);
+    assert!(!root.join("scene").exists() && root.join("scene.colmap.log").is_file());
 }
 
 #[test]
 fn a_camera_that_few_points_hold_is_left_out_and_said() {
     let root = &Folder::empty();
-    let (photos, out) = (photographed(root), root.join("scene"));
+    photographed(root);
     let mut model = model(9);
     for (index, (_, _, seen_by)) in model.points.iter_mut().enumerate() {
         let first = if index < 6 { 7 } else { 8 };
         *seen_by = (first..16).collect();
     }
     model.write_binary(&root.join("models/0"));
-    let (stdout, stderr) = run(&line(&photos, &out, &stub(root, &models(root)), ""), 0);
-    assert!(stdout.contains("8 of 9 photographs with their cameras"), "{stdout}");
+    stub(root, MODELS);
+    let (stdout, stderr) = root.run(&pose(""), 0);
+    says(&stdout, &["8 of 9 photographs with their cameras"]);
     let left_out = "left out: v00.png (6); half of all photographs see 20";
     assert!(stderr.contains(left_out) && !stderr.contains("have no camera"), "{stderr}");
-    let dataset = load(&out);
+    let dataset = load(&root.join("scene"));
     let names: BTreeSet<&str> = dataset.views.iter().map(|view| view.name.as_str()).collect();
     assert!(names.len() == 8 && !names.contains("v00"), "{names:?}");
 }
@@ -138,9 +119,8 @@ fn what_is_burnt_in_has_no_features_and_is_masked_in_the_dataset() {
     photograph(&photos.join("masks/v03.png"), SIZE, 1.0);
     photograph(&photos.join("masks/v04.png"), SIZE, 0.0);
     model(9).write_binary(&root.join("models/0"));
-    let cases = format!("feature_extractor) cp -r $masks {};;\n{}", seen.display(), models(root));
-    let (_, stderr) = run(&line(&photos, &out, &stub(root, &cases), ""), 0);
-    assert!(stderr.contains(" % of the photographs of 40x30 hardly changes"), "{stderr}");
+    stub(root, &format!("feature_extractor) cp -r $masks $root/seen;;\n{MODELS}"));
+    says(&root.run(&pose(""), 0).1, &[" % of the photographs of 40x30 hardly changes"]);
     let shown =
         |mask: &Path, x: u32, y: u32| Image::load(mask).unwrap().data[(40 * y + x) as usize] > 0.0;
     for mask in [seen.join("v03.png.png"), seen.join("v08.png.png"), out.join("masks/v08.png")] {
@@ -184,9 +164,8 @@ fn a_dim_dashboard_has_no_features() {
         picture.save_png8(photos.join(format!("v{index:02}.png"))).unwrap();
     }
     model(9).write_binary(&root.join("models/0"));
-    let cases = format!("feature_extractor) cp -r $masks {};;\n{}", seen.display(), models(root));
-    let (_, stderr) = run(&line(&photos, &root.join("scene"), &stub(root, &cases), ""), 0);
-    assert!(stderr.contains("hardly changes between views that move"), "{stderr}");
+    stub(root, &format!("feature_extractor) cp -r $masks $root/seen;;\n{MODELS}"));
+    says(&root.run(&pose(""), 0).1, &["hardly changes between views that move"]);
     let mask = Image::load(seen.join("v08.png.png")).unwrap();
     let pixels = || (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
     let is_shown = |x: u32, y: u32| mask.data[(width * y + x) as usize] > 0.0;
@@ -197,56 +176,47 @@ fn a_dim_dashboard_has_no_features() {
 #[test]
 fn few_photographs_start_from_a_closer_pair_and_options_go_to_their_command() {
     let root = &Folder::empty();
-    let (photos, out) = (photographed(root), root.join("scene"));
+    photographed(root);
     model(9).write_binary(&root.join("models/0"));
-    let copy = format!("cp -r {}/models/* $output", root.display());
-    let pose = |cases: &str, more: &str| {
-        line(&photos, &out, &stub(root, cases), &format!("--overwrite {more}"))
+    let for_angle = |angle: u32| {
+        let copy = "cp -r $root/models/* $output";
+        stub(root, &format!("mapper) [ \"$angle\" = {angle} ] && {copy}; exit 0;;"));
     };
-    let relaxed = format!("mapper) [ \"$angle\" = 2 ] && {copy}; exit 0;;");
-    let (stdout, stderr) = run(&pose(&relaxed, ""), 0);
-    assert!(stdout.contains("9 of 9 photographs"), "{stdout}");
+    for_angle(2);
+    let (stdout, stderr) = root.run(&pose(""), 0);
+    says(&stdout, &["9 of 9 photographs"]);
     assert_eq!(stderr.matches("registering again, from a closer pair").count(), 2, "{stderr}");
-    let log = fs::read_to_string(out.join("colmap.log")).unwrap();
-    assert!(
-        log.contains("--Mapper.init_max_forward_motion 1 --Mapper.init_min_num_inliers 50"),
-        "{log}"
-    );
+    let relaxed = "--Mapper.init_max_forward_motion 1 --Mapper.init_min_num_inliers 50";
+    says(&root.text("scene/colmap.log"), &[relaxed]);
 
     // The user's value is the only one.
-    let asked = format!("mapper) [ \"$angle\" = 3 ] && {copy}; exit 0;;");
-    run(&pose(&asked, "--colmap-option Mapper.init_min_tri_angle=3"), 0);
-    let log = fs::read_to_string(out.join("colmap.log")).unwrap();
+    for_angle(3);
+    let asked = |option: &str| pose(&format!("--overwrite --colmap-option {option}"));
+    root.succeed(&asked("Mapper.init_min_tri_angle=3"));
+    let log = root.text("scene/colmap.log");
     assert_eq!(log.matches("init_min_tri_angle").count(), 1, "{log}");
-    for (option, parts) in [
-        (
-            "Mapper.nothing=3",
-            ["Mapper.nothing", "none of feature_extractor, exhaustive_matcher, mapper has"],
-        ),
-        ("Mapper.init_min_tri_angle", ["Mapper.init_min_tri_angle", "is not NAME=VALUE"]),
-    ] {
-        refused(&pose(&asked, &format!("--colmap-option {option}")), 2, &parts);
-    }
+    let none_has = "none of feature_extractor, exhaustive_matcher, mapper has";
+    root.refused(&asked("Mapper.nothing=3"), 2, &["Mapper.nothing", none_has]);
+    let valueless = ["Mapper.init_min_tri_angle", "is not NAME=VALUE"];
+    root.refused(&asked("Mapper.init_min_tri_angle"), 2, &valueless);
 }
 
 #[test]
 fn learned_features_are_tried_where_most_photographs_have_no_camera() {
     let root = &Folder::empty();
-    let (photos, out) = (photographed(root), root.join("scene"));
+    photographed(root);
     model(4).write_binary(&root.join("some/0"));
     model(9).write_binary(&root.join("all/0"));
-    let cases = format!(
-        "mapper) case $database in */learned-*) cp -r {0}/all/* $output;; *) cp -r {0}/some/* $output;; esac;;",
-        root.display()
+    learned_stub(
+        root,
+        "mapper) case $database in */learned-*) cp -r $root/all/* $output;; *) cp -r $root/some/* $output;; esac;;",
     );
-    let (stdout, stderr) = run(&line(&photos, &out, &learned_stub(root, &cases), ""), 0);
-    assert!(stdout.contains("9 of 9 photographs"), "{stdout}");
+    let (stdout, stderr) = root.run(&pose(""), 0);
+    says(&stdout, &["9 of 9 photographs"]);
     let plan = "SIFT features; if most photographs have no camera, learned ones too";
-    for told in [plan, "4 of 9 have a camera: learned features, for at most 2 min"] {
-        assert!(stderr.contains(told), "no `{told}` in: {stderr}");
-    }
+    says(&stderr, &[plan, "4 of 9 have a camera: learned features, for at most 2 min"]);
     assert!(!stderr.contains("matching again"), "{stderr}");
-    let log = fs::read_to_string(out.join("colmap.log")).unwrap();
+    let log = root.text("scene/colmap.log");
     for option in
         ["--FeatureExtraction.type ALIKED_N16ROT", "--FeatureMatching.type ALIKED_LIGHTGLUE"]
     {
@@ -254,67 +224,53 @@ fn learned_features_are_tried_where_most_photographs_have_no_camera() {
     }
 
     // On request, they are the first and only ones.
-    let learned = "--overwrite --features learned";
-    let (_, stderr) = run(&line(&photos, &out, &learned_stub(root, &cases), learned), 0);
-    assert!(stderr.contains("learned features: ALIKED, matched by LightGlue"), "{stderr}");
-    let log = fs::read_to_string(out.join("colmap.log")).unwrap();
+    let (_, stderr) = root.run(&pose("--overwrite --features learned"), 0);
+    says(&stderr, &["learned features: ALIKED, matched by LightGlue"]);
+    let log = root.text("scene/colmap.log");
     assert_eq!((log.matches("$ ").count(), log.matches("ALIKED_N16ROT").count()), (3, 1), "{log}");
     // With SIFT asked for, none are tried.
-    let sift = "--overwrite --features sift --patience 0.1";
-    let (_, stderr) = run(&line(&photos, &out, &learned_stub(root, &cases), sift), 0);
+    let (_, stderr) = root.run(&pose("--overwrite --features sift --patience 0.1"), 0);
     assert!(!stderr.contains("learned"), "{stderr}");
 }
 
 #[test]
 fn a_colmap_without_learned_features_or_their_networks_is_told_with_the_remedy() {
     let root = &Folder::empty();
-    let (photos, out) = (photographed(root), root.join("scene"));
-    let ask = |colmap: &Path| line(&photos, &out, colmap, "--features learned");
-    let parts = [
-        "--features learned: this COLMAP has no ALIKED features",
-        "--colmap PATH",
-        "--features sift",
-    ];
-    refused(&ask(&stub(root, &models(root))), 2, &parts);
-    assert!(!out.exists());
+    photographed(root);
+    let ask = pose("--features learned");
+    stub(root, MODELS);
+    let without = "--features learned: this COLMAP has no ALIKED features";
+    root.refused(&ask, 2, &[without, "--colmap PATH", "--features sift"]);
+    assert!(!root.join("scene").exists());
+    let onnx = "ALIKED feature extraction requires ONNX support.";
     for (printed, parts) in [
-        (
-            "ALIKED feature extraction requires ONNX support.",
-            ["built without ONNX", "--features sift"],
-        ),
+        (onnx, ["built without ONNX", "--features sift"]),
         ("Check failed: Failed to download file", ["could not fetch", "n16rot_model_path=FILE"]),
     ] {
-        let fails = format!("feature_extractor) echo '{printed}' >&2; exit 1;;");
-        let (_, stderr) = run(&ask(&learned_stub(root, &fails)), 2);
-        let error = stderr.lines().last().unwrap();
-        assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        learned_stub(root, &format!("feature_extractor) echo '{printed}' >&2; exit 1;;"));
+        let (_, stderr) = root.run(&ask, 2);
+        says(stderr.lines().last().unwrap(), &parts);
     }
     // What is tried without being asked for is a warning, and SIFT goes on.
     model(4).write_binary(&root.join("some/0"));
     model(9).write_binary(&root.join("all/0"));
-    let cases = format!(
+    learned_stub(
+        root,
         "feature_extractor) case $database in */learned-*) echo 'requires ONNX support' >&2; exit 1;; esac;;\n\
-         mapper) case $database in */guided.db) cp -r {0}/all/* $output;; *) cp -r {0}/some/* $output;; esac;;",
-        root.display()
+         mapper) case $database in */guided.db) cp -r $root/all/* $output;; *) cp -r $root/some/* $output;; esac;;",
     );
-    let (stdout, stderr) = run(&line(&photos, &out, &learned_stub(root, &cases), ""), 0);
-    assert!(stdout.contains("9 of 9 photographs"), "{stdout}");
-    says(
-        &stderr,
-        &["built without ONNX", "going on with SIFT", "4 of 9 have a camera: matching again"],
-    );
+    let (stdout, stderr) = root.run(&pose(""), 0);
+    says(&stdout, &["9 of 9 photographs"]);
+    let told = ["built without ONNX", "going on with SIFT", "4 of 9 have a camera: matching again"];
+    says(&stderr, &told);
 }
 
 #[test]
 fn an_archive_of_photographs_is_read_in_place() {
     let root = &Folder::empty();
-    let (photos, out) = (photographed(root), root.join("scene"));
-    let zip = root.join("photos.zip");
-    pack(&photos, &zip, "scan/");
+    pack(&photographed(root), &root.join("photos.zip"), "scan/");
     model(9).write_binary(&root.join("models/0"));
-    let colmap = stub(root, &models(root));
-    let arguments = line(&zip, &out, &colmap, "");
-    let (stdout, _) = run(&arguments, 0);
-    assert!(stdout.contains("9 of 9 photographs"), "{stdout}");
-    assert_eq!(load(&out).views.len(), 9);
+    stub(root, MODELS);
+    says(&root.succeed(&pose("").replace("@photos", "@photos.zip")), &["9 of 9 photographs"]);
+    assert_eq!(load(&root.join("scene")).views.len(), 9);
 }

@@ -1,18 +1,11 @@
 //! Camera RAW: a minimal file, its linear light, and training on it.
 
-use std::fs;
-use std::path::Path;
-
-use nightsplat::gpu::testing::gpu;
-use nightsplat::targets::pseudo_gt::PseudoGt;
-use nightsplat_photographs::image::{Image, ImageFile, linear_from_srgb, srgb_from_linear};
+use nightsplat_photographs::image::srgb_from_linear;
 use nightsplat_photographs::scene_tone::SceneTone;
-use nightsplat_photographs::tone::{InverseTone, MeasuredPhotograph, ToneCurve, ToneSettings};
-use nightsplat_synth::SyntheticOptions;
+use nightsplat_photographs::tone::{InverseTone, MeasuredPhotograph};
 
-use super::synthetic::Folder;
-use crate::common::Random;
-use crate::common::command::succeed;
+use crate::common::paths;
+use crate::common::prelude::*;
 
 /// Sensor values without light, and at saturation.
 const BLACK: u16 = 256;
@@ -239,42 +232,34 @@ fn a_damaged_raw_is_named() {
     }
 }
 
-/// The score after a few steps of training on a dataset.
-fn trained(set: &Path) -> f64 {
-    let out = set.with_extension("run");
-    let options = "--steps 60 --sh-degree 0 --model plain --curve auto --progress none";
-    succeed(&format!("train {} --out {} {options}", set.display(), out.display()));
-    let metrics: serde_json::Value =
-        serde_json::from_slice(&fs::read(out.join("metrics.json")).unwrap()).unwrap();
-    metrics["mean"]["psnr"].as_f64().unwrap()
-}
-
 /// Writes a synthetic set whose photographs are RAW, and returns their number.
 fn raw_set(set: &Path, options: &SyntheticOptions) -> usize {
     nightsplat_synth::write(set, options).unwrap();
-    let mut count = 0;
-    for entry in fs::read_dir(set.join("low")).unwrap() {
-        let path = entry.unwrap().path();
-        let image = Image::load(&path).unwrap();
+    let photographs = paths(&set.join("low"));
+    for path in &photographs {
+        let image = Image::load(path).unwrap();
         let light = |x: u16, y: u16| image.pixel(x.into(), y.into()).map(linear_from_srgb);
         let (width, height) = (image.width as u16, image.height as u16);
         fs::write(path.with_extension("dng"), dng(width, height, |x, y| counted(light(x, y))))
             .unwrap();
-        fs::remove_file(&path).unwrap();
-        count += 1;
+        fs::remove_file(path).unwrap();
     }
-    count
+    photographs.len()
 }
 
 #[test]
 fn photographs_in_raw_train_as_the_same_light_in_another_format() {
     let folder = Folder::empty();
-    let [encoded, raw] = ["encoded", "raw"].map(|name| folder.join(name));
     let options =
         SyntheticOptions { views: 9, width: 48, height: 36, ..SyntheticOptions::default() };
-    nightsplat_synth::write(&encoded, &options).unwrap();
-    assert!(raw_set(&raw, &options) >= 8);
-    let (encoded, raw) = (trained(&encoded), trained(&raw));
+    nightsplat_synth::write(folder.join("encoded"), &options).unwrap();
+    assert!(raw_set(&folder.join("raw"), &options) >= 8);
+    // After a few steps.
+    let [encoded, raw] = ["encoded", "raw"].map(|name| {
+        let options = "--steps 60 --sh-degree 0 --model plain --curve auto --progress none";
+        folder.succeed(&format!("train @{name} --out @{name}.run {options}"));
+        folder.json(&format!("{name}.run/metrics.json"))["mean"]["psnr"].as_f64().unwrap()
+    });
     assert!((encoded - raw).abs() < 0.1, "{encoded} dB of PNG, {raw} dB of RAW");
 }
 
@@ -323,31 +308,25 @@ fn light_on_the_sensor_comes_back_in_an_exr_through_target_and_inverse() {
 #[test]
 fn a_raw_set_stays_linear_to_the_exr_of_its_renders() {
     let folder = Folder::empty();
-    let [set, run, out] = ["set", "run", "out"].map(|name| folder.join(name));
     let options =
         SyntheticOptions { views: 12, width: 64, height: 48, ..SyntheticOptions::default() };
-    let photographs = raw_set(&set, &options);
-    let [set, run] = [&set, &run].map(|path| path.display());
-    succeed(&format!("train {set} --out {run} --steps 500 --plan none --progress none"));
-    let split =
-        format!("render {run} --split train --as linear --format exr --out {}", out.display());
-    succeed(&split);
+    let photographs = raw_set(&folder.join("set"), &options);
+    folder.succeed("train @set --out @run --steps 500 --plan none --progress none");
+    folder.succeed("render @run --split train --as linear --format exr --out @out");
     // Sums of the light of sensor and render by the sensor's light, a stop a bin.
     let mut bins = std::collections::BTreeMap::<i32, [f64; 3]>::new();
-    let mut seen = 0;
-    for entry in fs::read_dir(&out).unwrap() {
-        let path = entry.unwrap().path();
+    let renders = paths(&folder.join("out"));
+    for path in &renders {
         let name = path.file_stem().unwrap().to_string_lossy().into_owned();
         let sensor = Image::load(folder.join(format!("set/low/{name}.dng"))).unwrap();
-        let render = Image::load(&path).unwrap();
-        seen += 1;
+        let render = Image::load(path).unwrap();
         for (sensor, render) in sensor.data.iter().zip(&render.data) {
             let [sensor, render] = [sensor, render].map(|&x| f64::from(linear_from_srgb(x)));
             let sums = bins.entry(sensor.max(1e-9).log2().floor() as i32).or_default();
             *sums = [sums[0] + sensor, sums[1] + render, sums[2] + 1.0];
         }
     }
-    assert!(seen >= photographs - 3, "{seen} of {photographs}");
+    assert!(renders.len() >= photographs - 3, "{} of {photographs}", renders.len());
     let total: f64 = bins.values().map(|sums| sums[2]).sum();
     let stops: Vec<(i32, f64)> = bins
         .iter()

@@ -119,10 +119,16 @@ fn every_value_is_finite_and_in_range_at_every_extreme() {
 fn every_row_states_correctly_whether_it_rises_and_whether_it_clips() {
     for family in &FAMILIES {
         let name = family.name;
+        let constants = family.defaults();
         let values: Vec<f64> = grid().into_iter().map(|t| value(family, t)).collect();
         let rises = values.windows(2).all(|pair| pair[1] >= pair[0] - 1e-15);
         assert_eq!(rises, family.monotone, "{name}");
-        let constants = family.defaults();
+        for (offset, gain) in [(0.0, 1.0), (0.12, 1.0), (0.05, 1.3), (0.0, 4.0)] {
+            let value = |i| family.curve.value(f64::from(i) / 1000.0, offset, gain, &constants);
+            let values: Vec<f64> = (0..4000).map(value).collect();
+            assert!(values.is_sorted() || !rises, "{name} falls, offset {offset}, gain {gain}");
+            assert!(values.iter().all(|y| (0.0..=1.0).contains(y)), "{name}");
+        }
         let highest = grid().into_iter().map(|t| family.shape(t, &constants)).fold(0.0, f64::max);
         let unbounded_law = matches!(family.curve, ToneCurve::AseFloor);
         assert_eq!(highest <= 1.0 && !unbounded_law, family.bounded, "{name} reaches {highest}");

@@ -22,9 +22,14 @@ use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split, View};
 use nightsplat_photographs::image::{Image, ImageFile, Mask, Orientation};
 use serde_json::{Value, json};
 
-use crate::common::{Folder, says};
+use crate::common::{Folder, paths, says};
 use crate::log::warnings;
 use synthetic::*;
+
+/// The dataset of a listing must be refused.
+fn refuses_listing(edit: impl FnOnce(&mut Value), parts: &[&str]) {
+    refuses(&Folder::with_listing(9, edit), parts);
+}
 
 /// The dataset must be refused in one line that contains all of `parts`.
 fn refuses(root: &Path, parts: &[&str]) {
@@ -90,11 +95,8 @@ fn a_validation_listing_replaces_a_missing_test_listing() {
 fn the_realx3d_layout_keeps_test_poses_without_photographs_and_finds_files_without_extension() {
     let root = &Folder::empty();
     photographs(root, "train", 0..4, 1.0);
-    let listed = |split: &str, views: std::ops::Range<usize>| {
-        transforms(views.map(|index| frame(index, &format!("{split}/{}", name(index)))).collect())
-    };
-    write_json(root.join("transforms_train.json"), &listed("train", 0..4));
-    write_json(root.join("transforms_test.json"), &listed("test", 4..6));
+    write_json(root.join("transforms_train.json"), &listed("train", 0..4, ""));
+    write_json(root.join("transforms_test.json"), &listed("test", 4..6, ""));
     let dataset = load(root);
     assert_eq!(names(&dataset, Split::Train), ["v00", "v01", "v02", "v03"]);
     assert_eq!(level(view(&dataset, "v03").image.as_ref()), Some(13.0));
@@ -168,16 +170,13 @@ fn a_model_without_points_loads_without_points() {
 
 #[test]
 fn both_colmap_encodings_and_folders_give_the_same_dataset() {
-    let load_written = |folder: &str, text: bool| {
-        let root = Folder::empty();
-        photographs(&root, "images", 0..10, 1.0);
-        match text {
-            true => model(10).write_text(&root.join(folder)),
-            false => model(10).write_binary(&root.join(folder)),
+    let [binary, text] = Folder::with_either_model(&model(10)).map(|root| load(&root));
+    let moved = Folder::with_either_model(&model(10)).map(|root| {
+        for file in paths(&root.join("sparse/0")) {
+            fs::rename(&file, root.join("sparse").join(file.file_name().unwrap())).unwrap();
         }
         load(&root)
-    };
-    let binary = load_written("sparse/0", false);
+    });
     assert_eq!(names(&binary, Split::Test), ["v00", "v08"]);
     for (index, view) in binary.views.iter().enumerate() {
         assert_camera_is_view(view, index);
@@ -189,11 +188,7 @@ fn both_colmap_encodings_and_folders_give_the_same_dataset() {
         DVec3::new(1.0_f64.cos(), 1.0_f64.sin(), 0.2 * 3.0_f64.sin())
     );
     assert_eq!(binary.points[1].views, [2, 5, 8]);
-    for other in [
-        load_written("sparse/0", true),
-        load_written("sparse", false),
-        load_written("sparse", true),
-    ] {
+    for other in [text].into_iter().chain(moved) {
         assert_eq!(other.points, binary.points);
         let cameras =
             |dataset: &Dataset| dataset.views.iter().map(|view| view.camera).collect::<Vec<_>>();
@@ -348,9 +343,7 @@ fn downscaling_shrinks_cameras_and_photographs_together() {
 fn a_smaller_copy_of_the_photographs_rescales_their_cameras() {
     let size = json!({ "w": 80.0, "h": 63.0 });
     let folder = Folder::with_listing(3, |listing| extend(listing, &size));
-    for index in 0..3 {
-        photograph(&folder.join(format!("images/{}.png", name(index))), (20, 16), 0.1);
-    }
+    photographs_of_size(&folder, "images", 0..3, (20, 16), 1.0);
     let camera = load(&folder).views[0].camera;
     assert_eq!((camera.width, camera.height), (20, 16));
     assert!((camera.focal.x - FOCAL.x / 4.0).abs() < 1e-9);

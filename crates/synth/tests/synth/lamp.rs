@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
-use nightsplat_photographs::dataset::{Dataset, LoadOptions};
-use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb};
+use nightsplat_photographs::image::{Image, linear_from_srgb};
 use nightsplat_synth::{Capture, SyntheticOptions};
+
+use crate::{captured, image, loaded, written};
 
 fn set() -> SyntheticOptions {
     let lamp = Some(16.0);
@@ -13,16 +14,6 @@ fn set() -> SyntheticOptions {
 
 fn street() -> SyntheticOptions {
     SyntheticOptions { width: 80, height: 60, ..SyntheticOptions::street(3) }
-}
-
-fn written(options: &SyntheticOptions, capture: &Capture) -> tempfile::TempDir {
-    let folder = tempfile::tempdir().unwrap();
-    nightsplat_synth::write_captured(folder.path(), options, capture).unwrap();
-    folder
-}
-
-fn image(folder: &Path, name: &str) -> Image {
-    Image::load(folder.join(name)).unwrap()
 }
 
 fn green(image: &Image) -> Vec<f64> {
@@ -41,11 +32,11 @@ fn stops(folder: &Path, view: &str) -> Vec<f64> {
 
 #[test]
 fn a_view_is_lit_over_about_six_stops() {
-    let folder = written(&set(), &Capture::clean());
-    let street = written(&SyntheticOptions { lamp: Some(16.0), ..street() }, &Capture::clean());
+    let folder = captured(&set(), &Capture::clean());
+    let street = captured(&SyntheticOptions { lamp: Some(16.0), ..street() }, &Capture::clean());
     for (folder, views) in [(&folder, ["000", "008", "016"]), (&street, ["000", "008", "016"])] {
         let spread = views.map(|view| {
-            let stops = stops(folder.path(), view);
+            let stops = stops(folder, view);
             stops[stops.len() - 1 - stops.len() / 200] - stops[stops.len() / 200]
         });
         println!("{spread:?}");
@@ -56,20 +47,19 @@ fn a_view_is_lit_over_about_six_stops() {
 
 #[test]
 fn a_lit_test_view_is_what_its_photograph_would_be_without_darkening_and_noise() {
-    let folder = written(&set(), &Capture::clean());
+    let folder = captured(&set(), &Capture::clean());
     for view in ["000", "008", "016"] {
-        let [low, lit] = ["low", "lit"].map(|of| image(folder.path(), &format!("{of}/{view}.png")));
+        let [low, lit] = ["low", "lit"].map(|of| image(&folder, &format!("{of}/{view}.png")));
         assert!(low.data == lit.data, "{view}");
         let mean = lit.data.iter().sum::<f32>() / lit.data.len() as f32;
         assert!((0.2..0.6).contains(&mean), "{view}: {mean}");
         let white = lit.data.iter().filter(|&&value| value >= 1.0).count();
         assert!(white < lit.data.len() / 50, "{view}: {white} values are white");
     }
-    assert!(!folder.path().join("lit/001.png").exists());
-    let dark = written(&set(), &Capture::default());
+    assert!(!folder.join("lit/001.png").exists());
+    let dark = written(&set());
     for view in ["000", "008"] {
-        let [low, lit] =
-            ["low", "lit"].map(|of| green(&image(dark.path(), &format!("{of}/{view}.png"))));
+        let [low, lit] = ["low", "lit"].map(|of| green(&image(&dark, &format!("{of}/{view}.png"))));
         let [low, lit] = [low, lit].map(|light| light.iter().sum::<f64>());
         assert!(
             (lit / low / nightsplat_synth::DARKENING - 1.0).abs() < 0.1,
@@ -84,13 +74,13 @@ fn a_lit_test_view_is_what_its_photograph_would_be_without_darkening_and_noise()
 #[test]
 fn the_references_are_in_even_light() {
     for set in [set(), SyntheticOptions { lamp: Some(16.0), ..street() }] {
-        let [narrow, wide] = [Some(16.0), Some(30.0)]
-            .map(|lamp| written(&SyntheticOptions { lamp, ..set }, &Capture::default()));
-        let without = written(&SyntheticOptions { lamp: None, ..set }, &Capture::default());
-        assert!(!without.path().join("lit").exists());
+        let [narrow, wide] =
+            [Some(16.0), Some(30.0)].map(|lamp| written(&SyntheticOptions { lamp, ..set }));
+        let without = written(&SyntheticOptions { lamp: None, ..set });
+        assert!(!without.join("lit").exists());
         for view in ["000", "007"] {
-            let [a, b, unlit] = [&narrow, &wide, &without]
-                .map(|set| image(set.path(), &format!("high/{view}.png")));
+            let [a, b, unlit] =
+                [&narrow, &wide, &without].map(|set| image(set, &format!("high/{view}.png")));
             assert!(a.data == b.data, "{view}");
             // Shading and shadows make the darkest surfaces darker.
             let dark = |image: &Image| green(image).into_iter().filter(|&x| x < 0.03).count();
@@ -101,11 +91,10 @@ fn the_references_are_in_even_light() {
 
 #[test]
 fn a_point_is_brighter_from_nearby_and_on_the_axis() {
-    let set = written(&SyntheticOptions { lamp: Some(30.0), ..set() }, &Capture::clean());
-    let dataset = Dataset::load(set.path(), &LoadOptions::default()).unwrap();
-    let images: Vec<Image> = (dataset.views.iter())
-        .map(|view| image(set.path(), &format!("low/{}.png", view.name)))
-        .collect();
+    let set = captured(&SyntheticOptions { lamp: Some(30.0), ..set() }, &Capture::clean());
+    let dataset = loaded(&set);
+    let images: Vec<Image> =
+        (dataset.views.iter()).map(|view| image(&set, &format!("low/{}.png", view.name))).collect();
     let (mut as_expected, mut pairs) = (0, 0);
     for point in &dataset.points {
         let seen = point.views.iter().filter_map(|&view| {

@@ -9,3 +9,35 @@ mod lamp;
 mod night;
 mod street;
 mod synthetic;
+
+use std::path::Path;
+
+use nightsplat_photographs::dataset::{Dataset, LoadOptions};
+use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb};
+use nightsplat_synth::{Capture, SyntheticOptions};
+
+use common::Folder;
+
+fn written(options: &SyntheticOptions) -> Folder {
+    captured(options, &Capture::default())
+}
+
+fn captured(options: &SyntheticOptions, capture: &Capture) -> Folder {
+    let folder = Folder::empty();
+    nightsplat_synth::write_captured(&folder, options, capture).unwrap();
+    folder
+}
+
+fn loaded(folder: &Path) -> Dataset {
+    Dataset::load(folder, &LoadOptions::default()).unwrap()
+}
+
+fn image(folder: &Path, name: &str) -> Image {
+    Image::load(folder.join(name)).unwrap()
+}
+
+/// The mean in linear light.
+fn light(image: &Image) -> f64 {
+    let values = image.data.iter().map(|&value| f64::from(linear_from_srgb(value)));
+    values.sum::<f64>() / image.data.len() as f64
+}

@@ -1,9 +1,10 @@
 //! Night captures of the synthetic scenes: what a scene has at night, and what a camera does wrong there.
 
-use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb};
-use nightsplat_synth::{self, CameraFaults, Capture, DARKENING, Night, SyntheticOptions};
+use nightsplat_photographs::image::{Image, linear_from_srgb};
+use nightsplat_synth::{CameraFaults, Capture, DARKENING, Night, SyntheticOptions};
 
 use crate::common::fixture;
+use crate::{captured, image, light, written};
 
 const VIEWS: usize = 9;
 const WIDTH: u32 = 80;
@@ -14,9 +15,8 @@ fn photographed(street: bool, night: Night, capture: &Capture) -> [Vec<Image>; 2
     let usual = if street { SyntheticOptions::street(3) } else { SyntheticOptions::default() };
     let (views, width, height, seed) = (VIEWS, WIDTH, HEIGHT, 4);
     let options = SyntheticOptions { views, width, height, seed, night, ..usual };
-    let folder = tempfile::tempdir().unwrap();
-    nightsplat_synth::write_captured(folder.path(), &options, capture).unwrap();
-    let image = |of, view| Image::load(folder.path().join(format!("{of}/{view:03}.png"))).unwrap();
+    let folder = captured(&options, capture);
+    let image = |of, view| image(&folder, &format!("{of}/{view:03}.png"));
     ["low", "high"].map(|of| (0..VIEWS).map(|view| image(of, view)).collect())
 }
 
@@ -39,12 +39,6 @@ fn share(image: &Image, range: [f32; 2]) -> f64 {
     };
     let all = pixels(image, 0..HEIGHT);
     all.iter().filter(|pixel| within(pixel)).count() as f64 / all.len() as f64
-}
-
-/// The mean in linear light.
-fn light(image: &Image) -> f64 {
-    let values = image.data.iter().map(|&value| f64::from(linear_from_srgb(value)));
-    values.sum::<f64>() / image.data.len() as f64
 }
 
 /// The ratio of two photographs' green channels at a pixel, in linear light.
@@ -175,13 +169,10 @@ fn night_mode_lights_half_of_the_views_and_half_of_the_test_views() {
 /// The committed set is older than the nights.
 #[test]
 fn a_plain_set_keeps_its_bits() {
-    let folder = tempfile::tempdir().unwrap();
     let (views, width, height) = (3, 32, 24);
     let plain = SyntheticOptions { views, width, height, seed: 5, ..Default::default() };
-    nightsplat_synth::write(folder.path(), &plain).unwrap();
+    let folder = written(&plain);
     for name in ["low/000.png", "low/001.png", "low/002.png", "high/000.png", "high/002.png"] {
-        let [now, before] = [folder.path().to_owned(), fixture("lom")]
-            .map(|set| Image::load(set.join(name)).unwrap());
-        assert!(now == before, "{name}");
+        assert!(image(&folder, name) == image(&fixture("lom"), name), "{name}");
     }
 }

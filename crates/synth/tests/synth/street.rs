@@ -1,24 +1,17 @@
 //! The synthetic street: its light falls along it, and a view sees a part of it.
 
-use std::path::Path;
-
-use nightsplat_photographs::dataset::{Dataset, LoadOptions, Split};
-use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb};
+use nightsplat_photographs::dataset::{Dataset, Split};
 use nightsplat_synth::{DARKENING, SyntheticOptions};
+
+use crate::common::Folder;
+use crate::{image, light, loaded, written};
 
 /// The plots of the street.
 const PLOTS: u32 = 12;
 
-fn written(plots: u32) -> tempfile::TempDir {
-    let dir = tempfile::tempdir().unwrap();
-    let options =
-        SyntheticOptions { width: 64, height: 48, seed: 3, ..SyntheticOptions::street(plots) };
-    nightsplat_synth::write(dir.path(), &options).unwrap();
-    dir
-}
-
-fn loaded(dir: &Path) -> Dataset {
-    Dataset::load(dir, &LoadOptions::default()).unwrap()
+fn street(plots: u32) -> Folder {
+    let street = SyntheticOptions::street(plots);
+    written(&SyntheticOptions { width: 64, height: 48, seed: 3, ..street })
 }
 
 /// The share of views with at least `least` of their points between two places along the street.
@@ -36,7 +29,7 @@ fn share_of_views(dataset: &Dataset, from: f64, to: f64, least: f64) -> f64 {
 
 #[test]
 fn half_a_street_is_seen_by_little_more_than_half_of_its_views_and_a_quarter_by_a_third() {
-    let dataset = loaded(written(24).path());
+    let dataset = loaded(&street(24));
     assert_eq!(dataset.views.len(), 144);
     for (parts, most) in [(2, 0.60), (4, 0.36)] {
         let length = 24.0 / f64::from(parts);
@@ -51,7 +44,7 @@ fn half_a_street_is_seen_by_little_more_than_half_of_its_views_and_a_quarter_by_
 
 #[test]
 fn every_part_of_the_street_has_points_that_many_views_see() {
-    let dataset = loaded(written(PLOTS).path());
+    let dataset = loaded(&street(PLOTS));
     for plot in 0..PLOTS {
         let plot = f64::from(plot);
         let of_part =
@@ -68,12 +61,8 @@ fn every_part_of_the_street_has_points_that_many_views_see() {
 
 #[test]
 fn the_light_falls_eightfold_and_that_of_the_references_does_not() {
-    let dir = written(PLOTS);
-    let mean = |folder: &str, view: usize| {
-        let image = Image::load(dir.path().join(format!("{folder}/{view:03}.png"))).unwrap();
-        let values = image.data.iter().map(|&value| f64::from(linear_from_srgb(value)));
-        values.sum::<f64>() / image.data.len() as f64
-    };
+    let dir = street(PLOTS);
+    let mean = |folder: &str, view: usize| light(&image(&dir, &format!("{folder}/{view:03}.png")));
     let views = 6 * PLOTS as usize;
     let factor = |view: usize| mean("high", view) / mean("low", view);
     for view in (0..views).step_by(5) {
@@ -89,7 +78,7 @@ fn the_light_falls_eightfold_and_that_of_the_references_does_not() {
 
 #[test]
 fn every_eighth_view_is_a_test_view_and_they_are_all_along_the_street_and_in_every_lane() {
-    let dataset = loaded(written(PLOTS).path());
+    let dataset = loaded(&street(PLOTS));
     let centers = dataset.test_views().map(|view| view.camera.center());
     let centers: Vec<_> = centers.collect();
     assert_eq!(centers.len(), 9);

@@ -2,14 +2,17 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use glam::{DVec2, DVec3, Vec3};
 use nightsplat_core::camera::CameraModel;
-use nightsplat_photographs::dataset::{Dataset, LoadOptions, NormalOptions, Split};
-use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb};
+use nightsplat_photographs::dataset::{Dataset, LoadOptions, NormalOptions, Point, Split, View};
+use nightsplat_photographs::image::{Image, ImageFile as _};
 use nightsplat_synth::{DARKENING, Night, SyntheticOptions};
 use serde_json::Value;
+
+use crate::common::{Folder, contents};
+use crate::{image, light, loaded, written};
 
 const SMALL: SyntheticOptions = SyntheticOptions {
     views: 10,
@@ -25,33 +28,15 @@ const SMALL: SyntheticOptions = SyntheticOptions {
 
 /// Every file below a folder, by relative path.
 fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
-    let mut files = BTreeMap::new();
-    let mut folders = vec![root.to_owned()];
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(folder).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-            } else {
-                let name = path.strip_prefix(root).unwrap().to_string_lossy().replace('\\', "/");
-                files.insert(name, fs::read(path).unwrap());
-            }
-        }
-    }
-    files
-}
-
-fn written(options: &SyntheticOptions) -> tempfile::TempDir {
-    let dir = tempfile::tempdir().unwrap();
-    nightsplat_synth::write(dir.path(), options).unwrap();
-    dir
+    let name = |path: PathBuf| path.to_string_lossy().replace('\\', "/");
+    contents(root).into_iter().map(|(path, bytes)| (name(path), bytes)).collect()
 }
 
 #[test]
 fn equal_options_give_equal_bytes_and_another_seed_gives_different_ones() {
-    let first = files(written(&SMALL).path());
-    assert_eq!(first, files(written(&SMALL).path()));
-    let other = files(written(&SyntheticOptions { seed: 6, ..SMALL }).path());
+    let first = files(&written(&SMALL));
+    assert_eq!(first, files(&written(&SMALL)));
+    let other = files(&written(&SyntheticOptions { seed: 6, ..SMALL }));
     for changed in ["low/003.png", "high/003.png", "colmap_sparse/0/points3D.txt"] {
         assert_ne!(first[changed], other[changed], "{changed}");
     }
@@ -60,7 +45,7 @@ fn equal_options_give_equal_bytes_and_another_seed_gives_different_ones() {
 #[test]
 fn the_layout_is_that_of_lom() {
     let dir = written(&SMALL);
-    let files = files(dir.path());
+    let files = files(&dir);
     let mut expected: Vec<String> = ["low", "high"]
         .iter()
         .flat_map(|folder| (0..10).map(move |view| format!("{folder}/{view:03}.png")))
@@ -92,7 +77,7 @@ fn the_layout_is_that_of_lom() {
 #[test]
 fn the_set_loads_as_a_dataset_whose_points_project_into_their_views() {
     let dir = written(&SMALL);
-    let dataset = Dataset::load(dir.path(), &LoadOptions::default()).unwrap();
+    let dataset = loaded(&dir);
     assert_eq!(dataset.skipped, Vec::<String>::new());
     assert_eq!(dataset.views.len(), 10);
     assert_eq!(
@@ -119,13 +104,10 @@ fn the_set_loads_as_a_dataset_whose_points_project_into_their_views() {
 #[test]
 fn the_views_of_a_point_agree_on_its_colour() {
     let dir = written(&SyntheticOptions { width: 96, height: 72, ..SMALL });
-    let dataset = Dataset::load(dir.path(), &LoadOptions::default()).unwrap();
-    let references: Vec<Image> = dataset
-        .views
-        .iter()
-        .map(|view| Image::load(dir.path().join(format!("high/{}.png", view.name))).unwrap())
-        .collect();
-    let spread = |point: &nightsplat_photographs::dataset::Point| {
+    let dataset = loaded(&dir);
+    let reference = |view: &View| image(&dir, &format!("high/{}.png", view.name));
+    let references: Vec<Image> = dataset.views.iter().map(reference).collect();
+    let spread = |point: &Point| {
         let green = point.views.iter().map(|&view| {
             let pixel = dataset.views[view as usize].camera.project(point.position).unwrap();
             references[view as usize]
@@ -144,13 +126,8 @@ fn the_views_of_a_point_agree_on_its_colour() {
 #[test]
 fn the_dark_photograph_is_the_reference_darkened_in_linear_light() {
     let dir = written(&SMALL);
-    let load = |folder: &str| Image::load(dir.path().join(folder).join("004.png")).unwrap();
-    let mean = |image: &Image| {
-        image.data.iter().map(|&value| f64::from(linear_from_srgb(value))).sum::<f64>()
-            / image.data.len() as f64
-    };
-    let (low, high) = (load("low"), load("high"));
-    let factor = mean(&high) / mean(&low);
+    let [low, high] = ["low/004.png", "high/004.png"].map(|name| image(&dir, name));
+    let factor = light(&high) / light(&low);
     assert!((factor / DARKENING - 1.0).abs() < 0.05, "{factor}");
     let encoded_mean = |image: &Image| image.data.iter().sum::<f32>() / image.data.len() as f32;
     assert!((0.4..0.6).contains(&encoded_mean(&high)), "{}", encoded_mean(&high));
@@ -168,10 +145,10 @@ fn the_dark_photograph_is_the_reference_darkened_in_linear_light() {
 #[test]
 fn normal_maps_face_the_camera_and_have_the_normal_of_the_floor() {
     let dir = written(&SyntheticOptions { normals: true, ..SMALL });
-    let set = dir.path();
+    let set = &dir;
     let (maps, others): (BTreeMap<_, _>, BTreeMap<_, _>) =
         files(set).into_iter().partition(|(name, _)| name.starts_with("normals/"));
-    assert_eq!(others, files(written(&SMALL).path()), "the photographs are the same");
+    assert_eq!(others, files(&written(&SMALL)), "the photographs are the same");
     assert_eq!(maps.len(), 8, "{:?}", maps.keys());
     let normals = NormalOptions { load: true, ..NormalOptions::default() };
     let dataset = Dataset::load(set, &LoadOptions { normals, ..LoadOptions::default() }).unwrap();
@@ -194,7 +171,7 @@ fn normal_maps_face_the_camera_and_have_the_normal_of_the_floor() {
 
 #[test]
 fn invalid_options_are_refused() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::empty();
     for options in [
         SyntheticOptions { views: 1, ..SMALL },
         SyntheticOptions { views: 100_000, ..SMALL },
@@ -203,35 +180,32 @@ fn invalid_options_are_refused() {
         SyntheticOptions { street: Some(0), ..SMALL },
         SyntheticOptions { street: Some(4), fisheye: true, ..SMALL },
     ] {
-        assert!(nightsplat_synth::write(dir.path(), &options).is_err(), "{options:?}");
+        assert!(nightsplat_synth::write(&dir, &options).is_err(), "{options:?}");
     }
-    assert!(files(dir.path()).is_empty());
+    assert!(files(&dir).is_empty());
 }
 
 #[test]
 fn a_folder_that_cannot_be_created_is_named() {
-    let dir = tempfile::tempdir().unwrap();
-    fs::write(dir.path().join("taken"), "").unwrap();
-    let problem =
-        nightsplat_synth::write(dir.path().join("taken"), &SMALL).unwrap_err().to_string();
+    let dir = Folder::empty();
+    fs::write(dir.join("taken"), "").unwrap();
+    let problem = nightsplat_synth::write(dir.join("taken"), &SMALL).unwrap_err().to_string();
     assert!(problem.contains("taken"), "{problem}");
 }
 
 #[test]
 fn every_eighth_view_is_a_test_view() {
     let dir = written(&SyntheticOptions { views: 17, width: 16, height: 16, ..SMALL });
-    let dataset = Dataset::load(dir.path(), &LoadOptions::default()).unwrap();
-    let is_test = |(index, view): (usize, &nightsplat_photographs::dataset::View)| {
-        (view.split == Split::Test) == (index % 8 == 0)
-    };
+    let dataset = loaded(&dir);
+    let is_test = |(index, view): (usize, &View)| (view.split == Split::Test) == (index % 8 == 0);
     assert!(dataset.views.iter().enumerate().all(is_test));
 }
 
 #[test]
 fn a_fisheye_dataset_has_one_lens_in_both_listings_and_matching_points() {
     let dir = written(&SyntheticOptions { fisheye: true, ..SMALL });
-    let root = dir.path();
-    let listed = Dataset::load(root, &LoadOptions::default()).unwrap();
+    let root = &dir;
+    let listed = loaded(root);
     let camera = listed.views[0].camera;
     assert!(matches!(camera.model, CameraModel::Fisheye(_)), "{camera:?}");
     // The middle of the longer side is 65 degrees off the image's centre; nothing is outside the circle.

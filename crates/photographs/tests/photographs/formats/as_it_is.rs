@@ -164,8 +164,7 @@ fn a_fisheye_is_loaded_natively_from_every_listing_and_masked_outside_its_circle
     assert_eq!(mask.hidden(), camera.unseen());
     // A polynomial that falls from 5 degrees on is not a lens.
     let keys = json!({ "camera_model": "OPENCV_FISHEYE", "k1": -40.0 });
-    let folder = Folder::with_listing(9, |listing| extend(listing, &keys));
-    refuses(&folder, &["describe no lens"]);
+    refuses_listing(|listing| extend(listing, &keys), &["describe no lens"]);
 }
 
 #[test]

@@ -109,8 +109,8 @@ fn an_unsupported_camera_model_is_named() {
         (json!({"k4": 0.1}), ["not supported", "image_undistorter"]),
         (json!({"camera_model": "EQUIRECTANGULAR"}), ["EQUIRECTANGULAR", "faces of a cube"]),
     ] {
-        let folder = Folder::with_listing(3, |listing| extend(listing, &settings));
-        refuses(&folder, &[&["transforms.json"][..], &parts].concat());
+        let parts = [&["transforms.json"][..], &parts].concat();
+        refuses_listing(|listing| extend(listing, &settings), &parts);
     }
 }
 
@@ -233,13 +233,10 @@ fn invalid_intrinsics_are_refused() {
     for (key, value) in
         [("fl_x", json!(-3.0)), ("w", json!(0.0)), ("h", json!(1e12)), ("k1", json!(-90.0))]
     {
-        let folder = Folder::with_listing(3, |json| json[key] = value);
-        refuses(&folder, &["v00"]);
+        refuses_listing(|json| json[key] = value, &["v00"]);
     }
-    let folder = Folder::with_listing(3, |json| {
-        json.as_object_mut().unwrap().remove("fl_x");
-    });
-    refuses(&folder, &["v00", "neither fl_x nor camera_angle_x"]);
+    let without_focal = |json: &mut Value| drop(json.as_object_mut().unwrap().remove("fl_x"));
+    refuses_listing(without_focal, &["v00", "neither fl_x nor camera_angle_x"]);
     let cameras = vec![(3, "PINHOLE", 1, vec![f64::NAN; 4])];
     let folder = Folder::with_model(&Model { cameras, ..model(9) });
     refuses(&folder, &["cameras.bin", "camera 3", "focal length"]);
@@ -248,9 +245,7 @@ fn invalid_intrinsics_are_refused() {
 #[test]
 fn a_photograph_of_one_pixel_is_named_rather_than_an_option() {
     let folder = Folder::with_listing(3, |all| (all["w"], all["h"]) = (json!(1), json!(1)));
-    for index in 0..3 {
-        photograph(&folder.join(format!("images/{}.png", name(index))), (1, 1), 0.2);
-    }
+    photographs_of_size(&folder, "images", 0..3, (1, 1), 1.0);
     refuses(&folder, &["view v00: is of 1x1 pixels", "at least 16"]);
 }
 

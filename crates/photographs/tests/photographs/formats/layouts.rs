@@ -90,10 +90,7 @@ fn cameras_of_a_network_s_input_are_scaled_for_each_axis() {
     let of_input = |height: f64| {
         let lens = json!({ "w": 518.0, "h": height, "fl_x": 518.0, "fl_y": 392.0 });
         let folder = Folder::with_listing(9, |listing| extend(listing, &lens));
-        for index in 0..9 {
-            let path = folder.join(format!("images/{}.png", name(index)));
-            photograph(&path, (500, 375), dark(index));
-        }
+        photographs_of_size(&folder, "images", 0..9, (500, 375), 1.0);
         folder
     };
     let lines = warnings(|| {
@@ -132,9 +129,7 @@ fn a_path_of_a_model_or_listing_names_its_dataset() {
 fn downscaled_copies_scale_the_camera_and_the_largest_is_used() {
     let folder = Folder::empty();
     for (name, size) in [("images_4", (24, 18)), ("images_2", (32, 24))] {
-        (0..9).for_each(|index| {
-            photograph(&folder.join(name).join(format!("v0{index}.png")), size, 0.1);
-        });
+        photographs_of_size(&folder, name, 0..9, size, 1.0);
     }
     model(9).write_binary(&folder.join("sparse/0"));
     let lines = warnings(|| {
@@ -191,8 +186,8 @@ fn paths_of_another_machine_are_resolved_by_name_with_one_remark() {
             let path = |index: usize| format!("{before}{}.png", name(index));
             let mut written = model(9);
             if is_json {
-                let frames = (0..9).map(|index| frame(index, &path(index))).collect();
-                write_json(folder.join("transforms.json"), &transforms(frames));
+                let frames = (0..9).map(|index| frame(index, &path(index)));
+                write_json(folder.join("transforms.json"), &transforms(frames.collect()));
                 written.write_binary(&folder.join("colmap/sparse/0"));
             } else {
                 written.images.iter_mut().for_each(|(.., name)| *name = format!("{before}{name}"));
@@ -225,11 +220,8 @@ fn withheld_test_photographs_are_not_searched_elsewhere() {
     let folder = Folder::empty();
     photographs(&folder, "train", 0..8, 1.0);
     photographs(&folder, "elsewhere", 0..8, 1.0);
-    let listed = |split: &str, views: std::ops::Range<usize>| {
-        transforms(views.map(|index| frame(index, &format!("{split}/{}", name(index)))).collect())
-    };
-    write_json(folder.join("transforms_train.json"), &listed("train", 0..6));
-    write_json(folder.join("transforms_test.json"), &listed("test", 6..8));
+    write_json(folder.join("transforms_train.json"), &listed("train", 0..6, ""));
+    write_json(folder.join("transforms_test.json"), &listed("test", 6..8, ""));
     let dataset = load(&folder);
     assert!(dataset.test_views().all(|view| view.image.is_none() && view.reference.is_none()));
 }
@@ -276,34 +268,29 @@ fn names_are_compared_in_normalised_unicode() {
 
 #[test]
 fn hidden_files_are_not_photographs() {
-    let folder = Folder::empty();
-    photographs(&folder, "images", 0..9, 1.0);
+    let folder = Folder::with_model(&model(9));
     for index in 0..9 {
         let name = format!("images/._{}.png", name(index));
-        fs::write(folder.join(name), b"\0\x05\x16\x07Mac OS X").unwrap();
+        folder.write(&name, b"\0\x05\x16\x07Mac OS X");
     }
-    fs::write(folder.join("images/._a.heic"), "x").unwrap();
-    model(9).write_binary(&folder.join("sparse/0"));
+    folder.write("images/._a.heic", "x");
     let lines = warnings(|| assert_whole(&load(&folder), "dot files"));
     assert_eq!(lines, "");
 }
 
 #[test]
 fn an_archive_is_read_in_place() {
-    let folder = Folder::empty();
-    let root = folder.join("set");
-    photographs(&root, "images", 0..9, 1.0);
-    model(9).write_binary(&root.join("sparse/0"));
-    let zip = folder.join("set.zip");
+    let (folder, set) = (Folder::empty(), Folder::with_model(&model(9)));
+    let (root, zip) = (&*set, folder.join("set.zip"));
     for prefix in ["", "scan/"] {
-        pack(&root, &zip, prefix);
+        pack(root, &zip, prefix);
         assert_whole(&load(&zip), prefix);
     }
     // Also photographs that are read again.
     let dataset = load_with(&zip, LoadOptions { keep: Some(0), ..Default::default() });
     let image = dataset.views[3].loaded().unwrap();
     assert_eq!(level(image.as_deref()), Some(13.0));
-    assert_eq!(fs::read_dir(&folder).unwrap().count(), 2, "something was unpacked");
+    assert_eq!(fs::read_dir(&folder).unwrap().count(), 1, "something was unpacked");
     // Listed files outside the archive are not read.
     let outside = folder.join("outside.png");
     Image::filled(SIZE.0, SIZE.1, [0.1; 3]).save_png8(&outside).unwrap();
@@ -313,7 +300,7 @@ fn an_archive_is_read_in_place() {
         frame(2, "images/v02.png"),
     ]);
     write_json(root.join("transforms.json"), &listing);
-    pack(&root, &zip, "");
+    pack(root, &zip, "");
     let dataset = load_with(&zip, LoadOptions { test_every: Some(0), ..Default::default() });
     assert_eq!(names(&dataset, Split::Train), ["v02"]);
 
@@ -355,8 +342,7 @@ fn references_as_dark_as_the_photographs_are_not_references() {
     let root = &Folder::empty();
     for (split, views) in [("train", 0..7), ("test", 7..9)] {
         photographs(root, split, views.clone(), if split == "test" { 0.8 } else { 1.0 });
-        let frames = views.map(|index| frame(index, &format!("{split}/{}.png", name(index))));
-        write_json(root.join(format!("transforms_{split}.json")), &transforms(frames.collect()));
+        write_json(root.join(format!("transforms_{split}.json")), &listed(split, views, ".png"));
     }
     let lines = warnings(|| {
         let dataset = load(root);

@@ -104,17 +104,11 @@ fn a_photograph_is_rotated_if_its_camera_is_upright_and_else_kept_as_stored() {
     // For each orientation: as stored if the cameras' size is 40 x 30.
     for orientation in 1..=8 {
         let root = &Folder::empty();
-        let frames =
-            (0..9).map(|index| frame(index, &format!("images/{}.jpg", name(index)))).collect();
-        write_json(root.join("transforms.json"), &transforms(frames));
+        write_json(root.join("transforms.json"), &listed("images", 0..9, ".jpg"));
         let seen = if orientation >= 5 { (30, 40) } else { SIZE };
         for (stored, is_turned) in [(SIZE, false), (seen, orientation >= 5)] {
             for index in 0..9 {
-                jpeg(
-                    &root.join("images").join(name(index)).with_extension("jpg"),
-                    stored,
-                    orientation,
-                );
+                jpeg(&root.join(format!("images/{}.jpg", name(index))), stored, orientation);
             }
             let dataset = load(root);
             let image = view(&dataset, "v03").image.as_ref().unwrap();

@@ -4,6 +4,11 @@ use crate::common::{fixture, shared};
 
 use super::*;
 
+fn assert_counts(dataset: &Dataset, train: usize, test: usize, scene: &str) {
+    let counts = (dataset.train_views().count(), dataset.test_views().count());
+    assert_eq!(counts, (train, test), "{scene}");
+}
+
 /// The share of points that project into the views that see them.
 fn share_of_points_in_their_views(dataset: &Dataset) -> f64 {
     let (mut inside, mut all) = (0, 0);
@@ -74,11 +79,7 @@ fn the_lom_scenes_load_with_their_splits_and_points() {
     {
         let Some(root) = shared(&format!("data/lom/{scene}")) else { continue };
         let dataset = load_with(&root, LoadOptions { downscale: 2.0, ..Default::default() });
-        assert_eq!(
-            (dataset.train_views().count(), dataset.test_views().count()),
-            (train, test),
-            "{scene}"
-        );
+        assert_counts(&dataset, train, test, scene);
         assert!(dataset.views.iter().all(|view| view.image.is_some() && view.camera.width == 250));
         assert!(dataset.test_views().all(|view| view.reference.is_some()));
         assert!(dataset.train_views().all(|view| view.reference.is_none()));
@@ -93,11 +94,7 @@ fn realx3d_keeps_its_test_poses() {
     for (scene, train, test) in [("Cupcake", 30, 6), ("GearWorks", 27, 5)] {
         let Some(root) = shared(&format!("data/realx3d/{scene}")) else { continue };
         let dataset = load_with(&root, LoadOptions { downscale: 8.0, ..Default::default() });
-        assert_eq!(
-            (dataset.train_views().count(), dataset.test_views().count()),
-            (train, test),
-            "{scene}"
-        );
+        assert_counts(&dataset, train, test, scene);
         assert!(dataset.test_views().all(|view| view.image.is_none() && view.reference.is_none()));
         assert_eq!(dataset.skipped.len(), test, "{:?}", dataset.skipped);
         assert!(!dataset.points.is_empty());

@@ -4,6 +4,7 @@
 
 use std::fs::{self, File};
 use std::io::Write as _;
+use std::ops::Range;
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
@@ -14,6 +15,7 @@ use serde_json::{Value, json};
 use zip::write::{SimpleFileOptions, ZipWriter};
 
 pub(crate) use crate::common::Folder;
+use crate::common::contents;
 
 pub(crate) const SIZE: (u32, u32) = (40, 30);
 pub(crate) const FOCAL: DVec2 = DVec2::new(35.0, 36.0);
@@ -43,18 +45,21 @@ pub(crate) fn photograph(path: &Path, size: (u32, u32), value: f32) {
     Image::filled(size.0, size.1, [value; 3]).save_png8(path).unwrap();
 }
 
-pub(crate) fn photographs(
+pub(crate) fn photographs(root: &Path, folder: &str, views: Range<usize>, gain: f32) {
+    photographs_of_size(root, folder, views, SIZE, gain);
+}
+
+/// [`photographs`] of any size.
+pub(crate) fn photographs_of_size(
     root: &Path,
     folder: &str,
-    views: impl IntoIterator<Item = usize>,
+    views: Range<usize>,
+    size: (u32, u32),
     gain: f32,
 ) {
     for index in views {
-        photograph(
-            &root.join(folder).join(name(index)).with_extension("png"),
-            SIZE,
-            gain * dark(index),
-        );
+        let path = root.join(folder).join(name(index)).with_extension("png");
+        photograph(&path, size, gain * dark(index));
     }
 }
 
@@ -84,16 +89,18 @@ pub(crate) fn frame_of(pose: &DAffine3, file_path: &str) -> Value {
     json!({ "file_path": file_path, "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]] })
 }
 
-/// Frames of the photographs in `images/`.
-pub(crate) fn frames(count: usize) -> Vec<Value> {
-    (0..count).map(|index| frame(index, &format!("images/{}.png", name(index)))).collect()
-}
-
 pub(crate) fn transforms(frames: Vec<Value>) -> Value {
     json!({
         "w": f64::from(SIZE.0), "h": f64::from(SIZE.1), "fl_x": FOCAL.x, "fl_y": FOCAL.y,
         "cx": PRINCIPAL_POINT.x, "cy": PRINCIPAL_POINT.y, "frames": frames,
     })
+}
+
+/// The listing of some photographs of a folder, by this ending.
+pub(crate) fn listed(folder: &str, views: Range<usize>, ending: &str) -> Value {
+    transforms(
+        views.map(|index| frame(index, &format!("{folder}/{}{ending}", name(index)))).collect(),
+    )
 }
 
 /// Sets these keys of an object.
@@ -131,7 +138,7 @@ impl Folder {
     pub(crate) fn with_listing(views: usize, edit: impl FnOnce(&mut Value)) -> Self {
         let folder = Self::empty();
         photographs(&folder, "images", 0..views, 1.0);
-        let mut listing = transforms(frames(views));
+        let mut listing = listed("images", 0..views, ".png");
         edit(&mut listing);
         write_json(folder.join("transforms.json"), &listing);
         folder
@@ -275,18 +282,9 @@ pub(crate) fn orient(path: &Path, orientation: u8) {
 pub(crate) fn pack(from: &Path, zip: &Path, prefix: &str) {
     let mut writer = ZipWriter::new(File::create(zip).unwrap());
     let packed = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Deflated);
-    let mut folders = vec![from.to_owned()];
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(&folder).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-                continue;
-            }
-            let name = path.strip_prefix(from).unwrap().to_str().unwrap();
-            writer.start_file(format!("{prefix}{name}"), packed).unwrap();
-            writer.write_all(&fs::read(&path).unwrap()).unwrap();
-        }
+    for (path, bytes) in contents(from) {
+        writer.start_file(format!("{prefix}{}", path.display()), packed).unwrap();
+        writer.write_all(&bytes).unwrap();
     }
     writer.start_file("__MACOSX/._x.png", packed).unwrap();
     writer.finish().unwrap();
