@@ -65,7 +65,7 @@ impl Serving {
         let answer = self.exchange(request.as_bytes()).ok()?;
         let end = answer.windows(4).position(|bytes| bytes == b"\r\n\r\n")?;
         let head = std::str::from_utf8(&answer[..end]).unwrap();
-        says(&head, &["no-store", "default-src 'none'"]);
+        says(head, &["no-store", "default-src 'none'"]);
         Some((head[9..12].parse().unwrap(), answer[end + 4..].to_vec()))
     }
 

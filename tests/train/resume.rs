@@ -57,7 +57,7 @@ fn a_restored_run_continues_bit_for_bit() {
         let (expected, all) = finished(&mut new(), &folder);
         // Between passes of density control, right after one, and before the first.
         for step in [17, 20, 3] {
-            let mut restored = restored(&new, step, &folder);
+            let mut restored = restored(new, step, &folder);
             // The trainer's previous state is discarded.
             advance(&mut restored, step + 5);
             restored.restore(&folder.join("checkpoint.safetensors")).unwrap();

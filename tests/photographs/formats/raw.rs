@@ -314,7 +314,7 @@ fn a_raw_set_stays_linear_to_the_exr_of_its_renders() {
     folder.succeed("train @set --out @run --steps 500 --plan none --progress none");
     folder.succeed("render @run --split train --as linear --format exr --out @out");
     // Sums of the light of sensor and render by the sensor's light, a stop a bin.
-    let mut bins = std::collections::BTreeMap::<i32, [f64; 3]>::new();
+    let mut bins = BTreeMap::<i32, [f64; 3]>::new();
     let renders = paths(&folder.join("out"));
     for path in &renders {
         let name = path.file_stem().unwrap().to_string_lossy().into_owned();
