@@ -13,7 +13,9 @@ use glam::DVec3;
 use nightsplat::bench::scene::{self, BenchScene};
 use nightsplat::gpu::{DeviceChoice, Gpu, PassTime};
 use nightsplat::splats::device::Upload;
-use nightsplat::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
+use nightsplat::splats::render::{
+    GradientNorm, Gradients, RenderOptions, RenderSettings, Renderer,
+};
 use nightsplat::train::{TrainConfig, Trainer};
 use nightsplat::{Error, Result};
 use nightsplat_core::random::Stream;
@@ -120,9 +122,9 @@ fn rasteriser(gpu: &Gpu, [width, height]: [u32; 2], count: usize, features: Feat
                 grad_norm_sums: &mut grad_norm_sums,
                 visit_counts: &mut visit_counts,
             };
-            let damping = Damping { weight: 0.0, depth: 0.0 };
+            let norm = GradientNorm::default();
             let drawn = gaussians.slice();
-            renderer.backward(pass, drawn, &camera, &OPTIONS, damping, &d_render, gradients)
+            renderer.backward(pass, drawn, &camera, &OPTIONS, norm, &d_render, gradients)
         })
     })?;
     Ok((milliseconds, gpu.peak_memory()))

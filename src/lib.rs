@@ -199,8 +199,9 @@ pub use splats::lamp::Lamp;
 pub use splats::model::Model;
 pub use splats::packed_sh::StorageFormat;
 pub use splats::render::{
-    Damping, DepthConvention, DepthKind, Drawn, Gradients, Instance, Motion, Pick, PickedSplat,
-    Purpose, RenderOptions, RenderSettings, Renderer, SceneDepth, Status, Target, Viewpoint,
+    DepthConvention, DepthKind, Drawn, GradientNorm, Gradients, Instance, Motion, Pick,
+    PickedSplat, Purpose, RenderOptions, RenderSettings, Renderer, SceneDepth, Status, Target,
+    Viewpoint,
 };
 
 // Photographs and training.

@@ -1,7 +1,7 @@
 // Sums of the values of a gradient record over a subgroup: by shuffles, or some records at a time in shared memory.
 
 // Space for the values of a record, an even number.
-const uint RECORD_SPACE = RECORD_HEAD + MAX_CHANNELS + 1;
+const uint RECORD_SPACE = RECORD_HEAD + MAX_CHANNELS;
 
 // From RECORD values in each lane to their sums over the lanes: lane l gets those of the values l, l + SUBGROUP_SIZE
 // and so on, and zero after the last.

@@ -15,8 +15,9 @@ const uint MAX_CHANNELS = 11;
 // Values per pixel: RGB first.
 layout(constant_id = 2) const uint CHANNELS = 3;
 // Values of a gradient record before its channels: the moments 1, x, y, xx, xy, yy of dL/dsigma over the pixels, with
-// offsets from pixel to mean. The gradients of mean2d, conic and opacity are multiples of them.
-const uint RECORD_HEAD = 6;
+// offsets from pixel to mean, of which the gradients of mean2d, conic and opacity are multiples, and the sum of its
+// magnitudes.
+const uint RECORD_HEAD = 7;
 const uint RECORD = RECORD_HEAD + CHANNELS;
 // The vectors of four floats of a record and of a splat's values, filled up with zeros: a device loads sixteen bytes at
 // once.

@@ -14,7 +14,9 @@ use crate::Result;
 use crate::gpu::{Buffer, Resources, Sorting, Tile, TunedTile};
 use crate::splats::batches::GradientKind;
 use crate::splats::device::{DeviceGaussians, Layout, Upload};
-use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
+use crate::splats::render::{
+    GradientNorm, Gradients, RenderOptions, RenderSettings, Renderer, Status,
+};
 
 /// From a few pixels for narrow subgroups to 512 for wide ones.
 const SIZES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8], [32, 16]];
@@ -261,9 +263,9 @@ impl Pass {
                 grad_norm_sums: &mut self.grad_norm_sums,
                 visit_counts: &mut self.visit_counts,
             };
-            let damping = Damping { weight: 0.0, depth: 0.0 };
+            let norm = GradientNorm::default();
             let drawn = gaussians.slice();
-            renderer.backward(pass, drawn, &*camera, &OPTIONS, damping, d_render, gradients)
+            renderer.backward(pass, drawn, &*camera, &OPTIONS, norm, d_render, gradients)
         })?;
         let of = |name| stages::of_kernels(&times, &[name]);
         Ok([of("blend_forward"), of("blend_backward"), total(&times)])

@@ -111,7 +111,7 @@ const EXAMPLES: &str = "A LIST is comma-separated. Examples:
   nightsplat sweep photos --out presets --table presets --eval-every 50
   nightsplat sweep lom/buu lom/chair --out lom --curves ap3,ase --lpips lpips-alex.safetensors
   nightsplat sweep photos --out mine --curves 'ap3,a*t/(t+b); a = 1.1; b = 0.3' --renders other=pictures
-  nightsplat sweep photos --out density --grid density.gradient_threshold=1e-4,2e-4 --jobs 2";
+  nightsplat sweep photos --out density --grid density.gradient_threshold=5e-4,1e-3 --jobs 2";
 
 /// Trains the unfinished points and writes the results.
 pub fn run(args: &SweepArgs) -> Result<()> {

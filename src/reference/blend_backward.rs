@@ -11,7 +11,8 @@ use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices, Toleranc
 use crate::kernels::splat::RECORD_HEAD;
 
 /// Adds what one pixel with the values `render` and the gradient `d_render` contributes to `gradient_records` (splats,
-/// record): the moments of dL/dsigma, from the channels that `shapes` selects, and the gradients of the colours.
+/// record): the moments and magnitudes of dL/dsigma, from the channels that `shapes` selects, and the gradients of the
+/// colours.
 #[expect(clippy::too_many_arguments, reason = "a pixel, its splats and its gradients")]
 pub fn blend_pixel_backward(
     splats: &[Splat],
@@ -58,9 +59,10 @@ struct Pixel {
     d_render: Vec<f64>,
 }
 
-/// Adds the moments of dL/dsigma at an offset from the mean, in the order of a gradient record: 1, x, y, xx, xy, yy.
+/// Adds the moments of dL/dsigma at an offset from the mean, in the order of a gradient record: 1, x, y, xx, xy, yy,
+/// and the magnitude.
 fn add_moments(record: &mut [f64], d_sigma: f64, DVec2 { x, y }: DVec2) {
-    let powers = [1.0, x, y, x * x, x * y, y * y];
+    let powers = [1.0, x, y, x * x, x * y, y * y, d_sigma.signum()];
     record.iter_mut().zip(powers).for_each(|(sum, power)| *sum += d_sigma * power);
 }
 

@@ -33,6 +33,18 @@ pub struct DSplat {
     pub features: Vec<f64>,
     /// With respect to the depth in the view, where that is a channel.
     pub depth: f64,
+    /// The sum over the pixels of |dL/dsigma|.
+    pub magnitudes: f64,
+}
+
+impl DSplat {
+    /// The statistic of density control: the norm of the gradient of the mean, in units of `1 / half_view`; or the sum
+    /// of the norms of all pixels, with the root of the mean square of conic times offset.
+    pub fn norm(&self, splat: &Splat, half_view: DVec2, adds_pixels: bool) -> f64 {
+        let DVec3 { x, z, .. } = splat.conic;
+        let of_pixels = self.magnitudes * DVec2::new(x.sqrt(), z.sqrt());
+        (half_view * if adds_pixels { of_pixels } else { self.mean2d }).length()
+    }
 }
 
 /// A colour that a lamp lights.
@@ -208,6 +220,7 @@ impl<'a> BackwardInputs<'a> {
             color: DVec3::from_array([0, 1, 2].map(passes)),
             features: record[HEAD + 3..][..self.planes.feature_count].to_vec(),
             depth: if self.constants.view_depths == 0 { 0.0 } else { record[record.len() - 1] },
+            magnitudes: record[6],
         }
     }
 
@@ -297,13 +310,13 @@ impl<'a> BackwardInputs<'a> {
     }
 
     /// The increment of the statistics of density control.
-    fn damped_norm(&self, gaussian: &Gaussian, d_splat: &DSplat) -> f64 {
-        let Params { damping_weight, damping_depth, .. } = *self.params;
+    fn damped_norm(&self, gaussian: &Gaussian, splat: &Splat, d_splat: &DSplat) -> f64 {
+        let Params { damping_weight, damping_depth, adds_pixels, .. } = *self.params;
         let (weight, depth) =
             (f64::from(damping_weight), self.camera.depth(self.camera.view(gaussian.mean)));
         let nearness = (depth / f64::from(damping_depth)).min(1.0);
         let damping = weight * nearness * nearness + 1.0 - weight;
-        damping * (self.params.half_view.as_dvec2() * d_splat.mean2d).length()
+        damping * d_splat.norm(splat, self.params.half_view.as_dvec2(), adds_pixels != 0)
     }
 }
 
@@ -361,7 +374,7 @@ impl Reference for Kernel {
             if !is_finite {
                 status[0] |= if before & !STATUS_GRADIENT == 0 { STATUS_GRADIENT } else { 0 };
             } else if before == 0 && frozen == 0 {
-                grad_norm_sums[i] += scene.damped_norm(&gaussian, &d_splat) as f32;
+                grad_norm_sums[i] += scene.damped_norm(&gaussian, &splat, &d_splat) as f32;
                 visit_counts[i] += 1;
             }
         }
@@ -405,7 +418,7 @@ impl Reference for Kernel {
                 let gradient = scene.backward(&gaussian, &splat, color, &d_splat);
                 let mut numbers = vec![0.0; attributes + 1];
                 one.store(&gradient, 0, |at, value| numbers[at] = value);
-                numbers[attributes] = scene.damped_norm(&gaussian, &d_splat);
+                numbers[attributes] = scene.damped_norm(&gaussian, &splat, &d_splat);
                 numbers
             });
             let d_splat = scene.d_splat(&splat, slices.colors, &values(&record), i);
@@ -420,7 +433,7 @@ impl Reference for Kernel {
             moved.sh.iter_mut().for_each(|bound| *bound += basis);
             moved.quat += scene.quat_error(&gaussian, &splat, &d_splat);
             scene.store(&moved, i, |at, bound| gradients[at] += bound);
-            let norm = scene.damped_norm(&gaussian, &d_splat);
+            let norm = scene.damped_norm(&gaussian, &splat, &d_splat);
             let sum = f64::from(slices.grad_norm_sums[i].abs()) + norm;
             grad_norm_sums[i] = bounds[attributes] + 16.0 * UNIT * norm + 2.0 * UNIT * sum;
         }

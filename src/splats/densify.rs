@@ -32,7 +32,7 @@ pub use control::{DensityControl, DensityStrategy};
 pub struct DensifySettings {
     /// How they are densified.
     pub control: DensityControl,
-    /// Mean norm of the screen-space gradient, in normalised device units, above which a Gaussian is densified.
+    /// Mean [`GradientNorm`](crate::GradientNorm) above which a Gaussian is densified.
     pub gradient_threshold: f64,
     /// Standard deviation up to which the paper's control clones, in world units; larger Gaussians are split.
     pub split_scale: f64,
@@ -52,7 +52,7 @@ pub struct DensifySettings {
 pub struct DensifyInputs<'a> {
     /// Carried over to the new Gaussians.
     pub moments: &'a mut Moments,
-    /// Sums of the norms of the screen-space gradients, in normalised device units.
+    /// Sums of [`GradientNorm`](crate::GradientNorm)s.
     pub grad_norm_sums: &'a mut Buffer<f32>,
     /// The number of steps in which the Gaussian was visible.
     pub visit_counts: &'a mut Buffer<u32>,

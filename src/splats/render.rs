@@ -72,13 +72,23 @@ pub struct RenderOptions {
     pub background: [f32; 3],
 }
 
-/// Near-camera damping of the screen-space gradient in the statistics of density control.
+/// The norm of a Gaussian's screen-space gradient that density control adds up, in normalised device units.
 #[derive(Clone, Copy, Debug)]
-pub struct Damping {
-    /// The damped fraction, 0 to 1.
-    pub weight: f32,
+pub struct GradientNorm {
+    /// The sum of the norms of all pixels, to which fine texture adds; otherwise the norm of their sum, in which it
+    /// cancels.
+    pub adds_pixels: bool,
+    /// How much of it is damped near the camera, 0 to 1.
+    pub damping_weight: f32,
     /// Depth from which nothing is damped, in world units.
-    pub depth: f32,
+    pub damping_depth: f32,
+}
+
+impl Default for GradientNorm {
+    /// Of the sum over all pixels, undamped.
+    fn default() -> Self {
+        Self { adds_pixels: false, damping_weight: 0.0, damping_depth: 1.0 }
+    }
 }
 
 /// Outputs of the backward pass, for all Gaussians.
@@ -86,7 +96,7 @@ pub struct Damping {
 pub struct Gradients<'a> {
     /// (columns x Gaussians): the gradients of the parameters, all of them unless the renderer is made for Adam.
     pub parameters: &'a mut Buffer<f32>,
-    /// (Gaussians): sums of the norms of the screen-space gradients in normalised device units.
+    /// (Gaussians): sums of [`GradientNorm`]s.
     pub grad_norm_sums: &'a mut Buffer<f32>,
     /// (Gaussians): the number of steps in which each was visible.
     pub visit_counts: &'a mut Buffer<u32>,
@@ -304,7 +314,7 @@ impl Renderer {
         gaussians: impl Into<GaussianSlice<'a>>,
         viewpoint: impl Into<Viewpoint<'a>>,
         options: &RenderOptions,
-        damping: Damping,
+        norm: GradientNorm,
         d_render: &Buffer<f32>,
         gradients: Gradients<'_>,
     ) -> Result<()> {
@@ -357,8 +367,9 @@ impl Renderer {
                     half_view: view.half_view,
                     gaussian_count,
                     sh_degree: options.sh_degree,
-                    damping_weight: damping.weight,
-                    damping_depth: damping.depth,
+                    adds_pixels: norm.adds_pixels.into(),
+                    damping_weight: norm.damping_weight,
+                    damping_depth: norm.damping_depth,
                 },
                 project_backward::Buffers {
                     parameters: batch.rows(parameters, layout.words())?,

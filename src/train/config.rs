@@ -267,8 +267,9 @@ pub struct DensityConfig {
     /// Densification: conserving splits a Gaussian into two that cover the same area; paper clones and splits as
     /// LITA-GS.
     control: DensityControl = DensityControl::Conserving => Rule::OneOf(&DensityControl::NAMES), "--density NAME";
-    /// Densify Gaussians whose mean screen-space gradient, in normalised device coordinates, has at least this norm.
-    gradient_threshold: f64 = 4e-4 => Rule::POSITIVE;
+    /// Densify Gaussians whose screen-space gradient, in normalised device coordinates, has more than this norm in the
+    /// mean of the steps; conserving: the sum of the norms of all pixels, paper: the norm of their sum.
+    gradient_threshold: Option<f64> = None, "0.0016; paper: 0.0002" => Rule::POSITIVE;
     /// Paper's control only: split Gaussians larger than this fraction of the extent, clone smaller ones.
     split_scale: f64 = 0.01 => Rule::POSITIVE_OR_0;
     /// Prune Gaussians of lower opacity.
@@ -288,12 +289,7 @@ impl DensityConfig {
     /// The values of LITA-GS.
     #[doc(hidden)]
     pub fn paper() -> Self {
-        Self {
-            control: DensityControl::Paper,
-            gradient_threshold: 2e-4,
-            depth_seeding: 0,
-            ..Self::default()
-        }
+        Self { control: DensityControl::Paper, depth_seeding: 0, ..Self::default() }
     }
 }
 

@@ -379,7 +379,7 @@ mod tests {
         .unwrap();
         let mut expected = TrainConfig::default();
         expected.tone.alpha = 0.25;
-        expected.density.gradient_threshold = 1e-4;
+        expected.density.gradient_threshold = Some(1e-4);
         expected.downscale = 4.0;
         expected.background = Background::Black;
         expected.model.raw_colors = true;

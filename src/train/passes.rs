@@ -4,7 +4,7 @@ use nightsplat_core::random::Stream;
 use nightsplat_models::gaussians::Shape;
 use nightsplat_photographs::dataset::Dataset;
 
-use super::config::{Background, TrainConfig};
+use super::config::{Background, DensityConfig, TrainConfig};
 use super::streams;
 use crate::Result;
 use crate::gpu::Gpu;
@@ -60,10 +60,11 @@ fn floor(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Option<Sm
 fn densifier(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Densifier> {
     let frame = config.frame.unwrap_or_default();
     let cameras = dataset.train_views().map(|view| frame.camera(&view.camera));
+    let DensityConfig { control, gradient_threshold, split_scale, .. } = config.density;
     let settings = DensifySettings {
-        control: config.density.control,
-        gradient_threshold: config.density.gradient_threshold,
-        split_scale: config.density.split_scale * config.extent_of(dataset) * frame.scale,
+        control,
+        gradient_threshold: gradient_threshold.unwrap_or(control.strategy().gradient_threshold),
+        split_scale: split_scale * config.extent_of(dataset) * frame.scale,
         min_opacity: config.density.min_opacity,
         max_gaussians: config.max_gaussians,
         near: config.render_settings().near.into(),

@@ -127,6 +127,7 @@ mod tests {
 
     use super::*;
     use crate::Result;
+    use crate::splats::densify::DensityControl;
     use crate::train::NotFinite;
     use crate::train::layers::values;
 
@@ -164,6 +165,7 @@ mod tests {
             "falloff=1",
             "bands={}",
             "schedule.first_sh_degree=1",
+            "density.gradient_threshold=0.001",
         ];
         set.extend(rest.map(str::to_owned));
         TrainConfig::default().with(&set).unwrap()
@@ -186,6 +188,14 @@ mod tests {
             options.len(),
             "an option sets two settings"
         );
+    }
+
+    #[test]
+    fn the_threshold_of_density_control_is_stated_as_its_strategies_have_it() {
+        let [conserving, paper] = [DensityControl::Conserving, DensityControl::Paper]
+            .map(|control| control.strategy().gradient_threshold);
+        let stated = setting("density.gradient_threshold").unwrap().absent;
+        assert_eq!(stated, Some(&*format!("{conserving}; paper: {paper}")));
     }
 
     #[test]

@@ -24,7 +24,9 @@ use crate::gpu::{CheckReport, Gpu, PassTime, Recorder};
 use crate::loss::Term;
 use crate::splats::lamp::Lamp;
 use crate::splats::optimizer::{AdamStep, GaussianStep, LearningRates};
-use crate::splats::render::{Damping, Gradients, Instance, Purpose, RenderOptions, RenderSettings};
+use crate::splats::render::{
+    GradientNorm, Gradients, Instance, Purpose, RenderOptions, RenderSettings,
+};
 use crate::{Error, Result, splats};
 use nightsplat_photographs::exposures::Affine;
 
@@ -351,8 +353,11 @@ impl Trainer {
             sh_degree: clock.sh_degree(step),
             background: background(config, step),
         };
-        let damping =
-            Damping { weight: config.schedule.damping_weight(step), depth: scene.extent as f32 };
+        let norm = GradientNorm {
+            adds_pixels: config.density.control.strategy().adds_pixels,
+            damping_weight: config.schedule.damping_weight(step),
+            damping_depth: scene.extent as f32,
+        };
         let view = supervision.views.at_step(config, step);
 
         renderer.forward(pass, &gaussians.values, supervision.views.viewpoint(view), &options)?;
@@ -362,7 +367,7 @@ impl Trainer {
             &gaussians.values,
             supervision.views.viewpoint(view),
             &options,
-            damping,
+            norm,
             &supervision.d_render,
             Gradients {
                 parameters: &mut gaussians.gradients,

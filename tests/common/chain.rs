@@ -11,9 +11,9 @@ use nightsplat::reference::project_backward::{
     DSplat, Lit, project_gaussian_backward, splat_gradient,
 };
 use nightsplat::reference::splat::Splat;
-use nightsplat::splats::render::RenderSettings;
+use nightsplat::splats::render::{GradientNorm, RenderSettings};
 
-use super::setup::{Rendered, Setup};
+use super::setup::{Gradients, Rendered, Setup};
 use super::{Random, assert_close};
 
 /// A setup and the gradient of its render, (channels, H, W): the differentiated functional is their inner product.
@@ -42,8 +42,9 @@ pub(crate) struct Results {
     pub(crate) transmittances: Vec<f64>,
     /// In the order of the parameters.
     pub(crate) gradient: Vec<f64>,
-    /// By Gaussian: the increment of the statistics of density control.
+    /// By Gaussian: the increment of the statistics of density control, of all pixels together and of each.
     grad_norms: Vec<f64>,
+    pixel_norms: Vec<f64>,
     /// By channel.
     pub(crate) d_background: Vec<f64>,
     /// With respect to the lamp's numbers.
@@ -162,6 +163,7 @@ impl<'a> Chain<'a> {
             transmittances: vec![],
             gradient: vec![0.0; parameters.len()],
             grad_norms: vec![0.0; self.setup.count],
+            pixel_norms: vec![0.0; self.setup.count],
             d_background: vec![0.0; channels],
             lamp: [0.0; lamp::WIDTH],
         };
@@ -203,10 +205,12 @@ impl<'a> Chain<'a> {
                 (results.lamp.iter_mut().zip(share)).for_each(|(sum, d)| *sum += d_log_factor * d);
             }
             planes.store(&d, i, |at, value| results.gradient[at] = value);
-            let damping = Rendered::DAMPING;
-            let nearness = (depths[j] / f64::from(damping.depth)).min(1.0);
-            let undamped = 1.0 - f64::from(damping.weight) * (1.0 - nearness * nearness);
-            results.grad_norms[i] = undamped * (0.5 * camera.size * d_splat.mean2d).length();
+            let GradientNorm { damping_weight, damping_depth, .. } = Rendered::norm(false);
+            let nearness = (depths[j] / f64::from(damping_depth)).min(1.0);
+            let undamped = 1.0 - f64::from(damping_weight) * (1.0 - nearness * nearness);
+            let half_view = 0.5 * camera.size;
+            results.grad_norms[i] = undamped * d_splat.norm(splat, half_view, false);
+            results.pixel_norms[i] = undamped * d_splat.norm(splat, half_view, true);
         }
         results
     }
@@ -221,8 +225,10 @@ impl<'a> Chain<'a> {
             conic,
             opacity,
             color: DVec3::from_array([0, 1, 2].map(passes)),
-            features: record[9..][..self.setup.planes().feature_count].to_vec(),
+            features: record[RECORD_HEAD as usize + 3..][..self.setup.planes().feature_count]
+                .to_vec(),
             depth: if self.setup.settings.trains_depth { record[record.len() - 1] } else { 0.0 },
+            magnitudes: record[6],
         }
     }
 
@@ -264,10 +270,11 @@ impl<'a> Chain<'a> {
         let trained = Setup { is_trained: true, ..self.setup.clone() };
         let completed = trained.render().backward(&d_render);
         check("Adam's gradient", &completed.parameters, |results| &results.gradient, of_gradient);
-        assert_eq!(completed.grad_norm_sums, gradients.grad_norm_sums, "{name}");
-        let norms: Vec<f32> =
-            gradients.grad_norm_sums.iter().map(|sum| sum - Rendered::NORM_BEFORE).collect();
-        check("gradient norm", &norms, |results| &results.grad_norms, of_gradient);
+        let norms = |gradients: &Gradients| -> Vec<f32> {
+            gradients.grad_norm_sums.iter().map(|sum| sum - Rendered::NORM_BEFORE).collect()
+        };
+        check("gradient norm", &norms(&gradients), |results| &results.grad_norms, of_gradient);
+        check("pixels' norms", &norms(&completed), |results| &results.pixel_norms, of_gradient);
         for (i, &visits) in gradients.visit_counts.iter().enumerate() {
             let visits = visits - Rendered::VISITS_BEFORE;
             let leaves_a_trace = exact.grad_norms[i] > 0.0;

@@ -16,7 +16,9 @@ use nightsplat::splats::lamp::Lamp;
 use nightsplat::splats::optimizer::{
     Adam, AdamBuffers, AdamStep, GaussianStep, LearningRates, Moments,
 };
-use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
+use nightsplat::splats::render::{
+    self, GradientNorm, RenderOptions, RenderSettings, Renderer, Status,
+};
 use nightsplat_core::camera::{self, CameraModel, KannalaBrandt, Patch};
 use nightsplat_models::gaussians::{Features, Gaussians, Shape};
 use nightsplat_photographs::tone::Profile;
@@ -255,7 +257,11 @@ pub(crate) struct Gradients {
 }
 
 impl<'a> Rendered<'a> {
-    pub(crate) const DAMPING: Damping = Damping { weight: 0.7, depth: 3.0 };
+    /// Of all pixels together; as Adam is trained, of each pixel.
+    pub(crate) fn norm(is_trained: bool) -> GradientNorm {
+        GradientNorm { adds_pixels: is_trained, damping_weight: 0.7, damping_depth: 3.0 }
+    }
+
     /// The statistics before the backward pass, which adds to them.
     pub(crate) const NORM_BEFORE: f32 = 0.5;
     pub(crate) const VISITS_BEFORE: u32 = 3;
@@ -322,7 +328,7 @@ impl<'a> Rendered<'a> {
                 &*gaussians,
                 camera,
                 options,
-                Self::DAMPING,
+                Self::norm(setup.is_trained),
                 &d_render,
                 gradients,
             )

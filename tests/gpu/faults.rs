@@ -34,7 +34,7 @@ fn config() -> TrainConfig {
     config.schedule.densify_interval = 4;
     config.schedule.sh_degree_interval = 5;
     config.schedule.resolution_steps = [0, 0];
-    config.density.gradient_threshold = 1e-7;
+    config.density.gradient_threshold = Some(1e-7);
     config
 }
 
@@ -163,7 +163,7 @@ fn growing() -> TrainConfig {
     config.schedule.sh_degree_interval = 20;
     config.schedule.resolution_steps = [0, 0];
     config.density.control = DensityControl::Paper;
-    config.density.gradient_threshold = 1e-9;
+    config.density.gradient_threshold = Some(1e-9);
     config.density.min_opacity = 1e-4;
     config
 }

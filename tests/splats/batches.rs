@@ -132,7 +132,7 @@ fn config() -> TrainConfig {
     (config.schedule.densify_after, config.schedule.densify_interval) = (4, 5);
     config.schedule.densify_before = 25;
     config.schedule.sh_degree_interval = 7;
-    config.density.gradient_threshold = 1e-6;
+    config.density.gradient_threshold = Some(1e-6);
     // Small Gaussians, which intersect few tiles: a binding holds the intersections of all of them on each device.
     config.start.scale = 0.1;
     config.tile = Some([16, 16].into());

@@ -31,7 +31,7 @@ fn config(parts: &[Part]) -> TrainConfig {
     config.schedule.densify_after = 1;
     config.schedule.densify_interval = 2;
     config.schedule.sh_degree_interval = 1;
-    config.density.gradient_threshold = 1e-6;
+    config.density.gradient_threshold = Some(1e-6);
     set_small_parts(&mut config, parts);
     config
 }

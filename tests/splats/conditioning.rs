@@ -15,8 +15,8 @@ use nightsplat_photographs::tone::percentiles;
 use crate::common::prelude::*;
 use crate::common::widen;
 
-/// Numbers in a record of three channels: six moments, colour.
-const RECORD: usize = 9;
+/// Numbers in a record of three channels: six moments, the sum of magnitudes, colour.
+const RECORD: usize = 10;
 /// The same as stored, with zeros.
 const STORED_RECORD: usize = 12;
 

@@ -230,6 +230,29 @@ fn the_gradient_is_correct_where_one_part_of_a_tile_is_done_before_another() {
     }
 }
 
+/// A splat of some pixels under a checkerboard, and between a brighter and a darker half.
+#[test]
+fn the_pulls_of_fine_texture_cancel_in_their_sum_and_add_up_in_the_sum_of_norms() {
+    let mut setup = Setup::new(1, [32, 24], 0, 3);
+    let mean = setup.at_pixel(DVec2::new(16.0, 12.0), 3.0);
+    let log_scale = DVec3::splat((4.0 * 3.0 / setup.camera.focal.x).ln());
+    let sh = vec![DVec3::ONE];
+    setup.set(0, &Gaussian { mean, log_scale, raw_opacity: 0.0, sh, ..setup.get(0) });
+    let mut norm = |is_trained: bool, pull: fn(usize, usize) -> bool| {
+        setup.is_trained = is_trained;
+        let pulls = (0..3 * setup.pixels()).map(|at| pull(at % 32, at / 32 % 24));
+        let d_render: Vec<f32> = pulls.map(|brighter| if brighter { -1.0 } else { 1.0 }).collect();
+        setup.render().backward(&d_render).grad_norm_sums[0] - Rendered::NORM_BEFORE
+    };
+    let (fine, halves) =
+        (|x: usize, y: usize| (x + y).is_multiple_of(2), |x: usize, _: usize| x < 16);
+    let [sum_of_fine, norms_of_fine] = [false, true].map(|is_trained| norm(is_trained, fine));
+    let [sum_of_halves, norms_of_halves] = [false, true].map(|is_trained| norm(is_trained, halves));
+    assert!(norms_of_fine > 100.0 * sum_of_fine, "{norms_of_fine} {sum_of_fine}");
+    assert!(norms_of_halves < 3.0 * sum_of_halves, "{norms_of_halves} {sum_of_halves}");
+    assert!((norms_of_fine / norms_of_halves - 1.0).abs() < 0.1);
+}
+
 #[test]
 fn the_renderer_gives_the_chain_s_values() {
     for setup in variants() {

@@ -178,6 +178,7 @@ fn sums(intersection_ranges: Vec<UVec2>, gradient_records: &[Record]) -> Vec<f32
             half_view: Vec2::splat(16.0),
             gaussian_count: count as u32,
             sh_degree: 3,
+            adds_pixels: 0,
             damping_weight: 0.0,
             damping_depth: 1.0,
         },

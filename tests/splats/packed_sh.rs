@@ -7,7 +7,7 @@ use nightsplat_models::gaussians::width;
 use nightsplat::gpu::testing::gpu_that_binds;
 use nightsplat::splats::device::DeviceGaussians;
 use nightsplat::splats::optimizer::LearningRates;
-use nightsplat::splats::render::{Damping, Gradients};
+use nightsplat::splats::render::{GradientNorm, Gradients};
 use nightsplat::train::PrecisionConfig;
 
 use crate::common::own_gpu;
@@ -149,10 +149,9 @@ fn a_render_of_halves_equals_that_of_the_floats_they_represent() {
                         grad_norm_sums: &mut sums,
                         visit_counts: &mut visits,
                     };
-                    let damping = Damping { weight: 0.0, depth: 1.0 };
+                    let norm = GradientNorm::default();
                     let camera = &setup.camera;
-                    renderer
-                        .backward(pass, gaussians, camera, &options, damping, &d_render, gradients)
+                    renderer.backward(pass, gaussians, camera, &options, norm, &d_render, gradients)
                 })
             });
             done.unwrap();
@@ -180,7 +179,7 @@ fn config([rest, moments]: [StorageFormat; 2]) -> TrainConfig {
     (config.schedule.densify_after, config.schedule.densify_interval) = (4, 5);
     config.schedule.densify_before = 35;
     config.schedule.sh_degree_interval = 10;
-    config.density.gradient_threshold = 1e-6;
+    config.density.gradient_threshold = Some(1e-6);
     config.start.scale = 0.2;
     config.max_gaussians = 4000;
     config

@@ -1,6 +1,6 @@
 //! Views too large for one pass are rendered and trained on in patches, with the same result.
 
-use nightsplat::splats::render::{self, Damping};
+use nightsplat::splats::render::{self, GradientNorm};
 use nightsplat::train::{Part, Rendered};
 use nightsplat_core::camera::TrainingFrame;
 use nightsplat_photographs::dataset::View;
@@ -64,16 +64,8 @@ fn gradients(setup: &Setup, weights: &[f32]) -> [Vec<f32>; 3] {
                 grad_norm_sums: &mut grad_norm_sums,
                 visit_counts: &mut visit_counts,
             };
-            let damping = Damping { weight: 0.7, depth: 3.0 };
-            renderer.backward(
-                pass,
-                &gaussians,
-                patch,
-                &setup.options,
-                damping,
-                &d_render,
-                gradients,
-            )
+            let norm = GradientNorm { adds_pixels: true, damping_weight: 0.7, damping_depth: 3.0 };
+            renderer.backward(pass, &gaussians, patch, &setup.options, norm, &d_render, gradients)
         })
         .unwrap();
         for (sum, gradient) in sums.iter_mut().zip(gpu.read(&parameters).unwrap()) {

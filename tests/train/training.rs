@@ -63,7 +63,7 @@ fn a_round_of_density_control_hardly_changes_the_scores() {
         let mut config = TrainConfig { steps: 400, ..config() };
         config.density.control = control;
         (config.schedule.densify_after, config.schedule.densify_interval) = (100, 160);
-        config.density.gradient_threshold = 1e-4;
+        config.density.gradient_threshold = Some(1e-4);
         let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
         advance(&mut trainer, 159);
         let before = (trainer.gaussian_count(), mean_psnr(&dataset, &trainer.gaussians().unwrap()));
@@ -78,6 +78,25 @@ fn a_round_of_density_control_hardly_changes_the_scores() {
         paper > conserving + 0.3,
         "the paper's control loses {paper} dB, not more than {conserving}"
     );
+}
+
+/// Of one threshold, since what pixels pull in opposite directions counts for one of them alone.
+#[test]
+fn the_conserving_control_densifies_more_than_the_papers_which_scores_the_sum_over_pixels() {
+    let dataset = dataset();
+    let growth = |control: DensityControl| {
+        let mut config = TrainConfig { steps: 60, ..config() };
+        config.density.control = control;
+        config.density.gradient_threshold = Some(2e-3);
+        (config.schedule.densify_after, config.schedule.densify_interval) = (10, 30);
+        let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
+        advance(&mut trainer, 29);
+        let before = trainer.gaussian_count();
+        advance(&mut trainer, 31);
+        trainer.gaussian_count() as f64 / before as f64
+    };
+    let [conserving, paper] = [DensityControl::Conserving, DensityControl::Paper].map(growth);
+    assert!(conserving - 1.0 > 2.0 * (paper - 1.0).max(0.02), "{conserving} {paper}");
 }
 
 #[test]
@@ -341,7 +360,7 @@ fn growth_stops_at_the_limit() {
     let dataset = dataset();
     let limit = dataset.points.len() + 5;
     let mut config = TrainConfig { max_gaussians: limit, ..config() };
-    config.density.gradient_threshold = 1e-9;
+    config.density.gradient_threshold = Some(1e-9);
     // The last round may use all of the remaining capacity.
     config.schedule.densify_before = 60;
     let (_, gaussians) = train(&config, &dataset);

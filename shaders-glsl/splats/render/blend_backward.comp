@@ -37,7 +37,7 @@ layout(binding = 3) readonly  buffer Splats  { ProjectedSplat splats[]; };
 layout(binding = 4) readonly  buffer Colors  { vec4 colors[]; };  // (Gaussians, COLOR_VECTORS)
 layout(binding = 5) readonly  buffer Render  { float render[]; };    // (CHANNELS, H, W)
 layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNELS, H, W); of the depth, over alpha
-// (slots, RECORD_VECTORS): moments of dL/dsigma 6, gradients of the colour CHANNELS, zeros
+// (slots, RECORD_VECTORS): moments and magnitudes of dL/dsigma RECORD_HEAD, gradients of the colour CHANNELS, zeros
 layout(binding = 7) writeonly buffer GradientRecords { vec4 gradient_records[]; };
 layout(binding = 8) readonly  buffer Counts  { uint counts[]; };  // [0]: intersections
 layout(binding = 9) readonly  buffer Tiles   { uint sorted_tiles[]; };
@@ -190,6 +190,7 @@ void main() [[subgroup_uniform_control_flow]] {
                     moments[i] = vec3(0.0);
                 }
 
+                float magnitudes = 0.0;
                 float weights[GROUPS];
                 // Choices are between names, both computed: a compiler makes branches of others.
                 [[unroll]] for (uint g = 0; g < GROUPS; g++) {
@@ -214,6 +215,7 @@ void main() [[subgroup_uniform_control_flow]] {
                     bool is_held = any(bvec2(is_done, free_alpha > ALPHA_MAX));
                     float d_sigma = alpha / (1.0 - alpha) * light[g] - passed;
                     d_sigma = is_held ? 0.0 : d_sigma;
+                    magnitudes += abs(d_sigma);
                     float d_sigma_y = d_sigma * y;
                     moments[g % COLUMNS] += vec3(d_sigma, d_sigma_y, d_sigma_y * y);
                 }
@@ -227,6 +229,7 @@ void main() [[subgroup_uniform_control_flow]] {
                     record[4] += x * moments[i].y;
                     record[5] += moments[i].z;
                 }
+                record[6] = magnitudes;
                 [[unroll]] for (uint g = 0; g < GROUPS; g++) {
                     if (!sums_colors_last() || (splat.groups & 1u << g) == 0) continue;
                     [[unroll]] for (uint c = 0; c < CHANNELS; c++)

@@ -13,9 +13,8 @@
 //! Project backward: one lane per Gaussian, from the records of its slots to the gradients of its attributes.
 //!
 //! Sums the records, which gives the gradients of the splat, and applies the chain rule through `project`; the required
-//! values of the forward pass are recomputed. Also updates the statistics of density control: the norm of the
-//! screen-space gradient in normalised device units, damped near the camera. A gradient that is not finite sets a flag,
-//! so that neither this step nor later ones change a parameter.
+//! values of the forward pass are recomputed. Also updates the statistics of density control. A gradient that is not
+//! finite sets a flag, so that neither this step nor later ones change a parameter.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -26,7 +25,8 @@ layout(push_constant, scalar) uniform Params {
     vec2  half_view;       // half the view, pixels, by the share that the render is of its pixels
     uint  gaussian_count;
     uint  sh_degree;       // in use; at most SH_DEGREE
-    float damping_weight;  // 0 to 1: how much of the gradient statistic is damped near the camera
+    uint  adds_pixels;     // the statistic of density control is 1: the sum of pixels' norms, 0: the norm of their sum
+    float damping_weight;  // 0 to 1: how much of the statistic is damped near the camera
     float damping_depth;   // world units: no damping beyond
 };
 
@@ -108,6 +108,15 @@ vec3 sh_backward(uint i, vec3 offset, vec3 d_color) {
 uint largest_bits(vec3 v) {
     uvec3 bits = floatBitsToUint(v) & 0x7fffffffu;
     return max(max(bits.x, bits.y), bits.z);
+}
+
+// The statistic of density control: a norm of the screen-space gradient, in normalised device units. The pixels of fine
+// texture pull a splat that blurs it in opposite directions, so that their sum vanishes; a sum of norms does not (Ye et
+// al. 2024, AbsGS). A pixel's gradient is dL/dsigma times conic offset, whose components have the mean squares conic.xx
+// and conic.yy over a splat: that is used for every pixel.
+float gradient_norm(vec3 conic, vec2 d_mean2d, float magnitudes) {
+    vec2 of_pixels = magnitudes * sqrt(conic.xz);
+    return length(half_view * (adds_pixels == 0 ? d_mean2d : of_pixels));
 }
 
 void store_zero(uint i) {
@@ -235,7 +244,7 @@ void main() {
     if (flags == 0 && FROZEN_COLUMNS == 0) {
         float nearness = min(1.0, camera_depth(mean_in_view, camera) / damping_depth);
         float damping = damping_weight * nearness * nearness + 1.0 - damping_weight;
-        grad_norm_sums[i] += damping * length(half_view * d_mean2d);
+        grad_norm_sums[i] += damping * gradient_norm(splat.conic, d_mean2d, record[6]);
         visit_counts[i] += 1;
     }
 }

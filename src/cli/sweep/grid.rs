@@ -34,7 +34,7 @@ const CHANGES: [(&str, &[&str]); 8] = [
     ("schedule.initial_rate_factor", &["1"]),
     ("max_gaussians", &["2000", "4000"]),
     ("sh_degree", &["0", "1"]),
-    ("density.gradient_threshold", &["2e-4", "8e-4"]),
+    ("density.gradient_threshold", &["5e-4", "2e-3"]),
     ("ssim_weight", &["0"]),
 ];
 

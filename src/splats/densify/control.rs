@@ -26,6 +26,10 @@ pub struct DensityStrategy {
     /// Splits keep the render: a Gaussian is split only where the views of the cameras hardly change, and a round that
     /// costs the training views is repeated with fewer splits.
     pub keeps_views: bool,
+    /// Gaussians are scored by the sum of the gradients' norms of all pixels, not by the norm of their sum.
+    pub adds_pixels: bool,
+    /// The score from which a Gaussian is densified, unless a setting states another.
+    pub gradient_threshold: f64,
     /// Each round takes its share of the headroom below the limit instead of all that is left.
     pub spreads_growth: bool,
     /// Where there are few points, the first round adds Gaussians at rendered depths.
@@ -46,12 +50,16 @@ impl DensityControl {
             Self::Conserving => DensityStrategy {
                 name: "conserving",
                 keeps_views: true,
+                adds_pixels: true,
+                gradient_threshold: 1.6e-3,
                 spreads_growth: true,
                 seeds_depths: true,
             },
             Self::Paper => DensityStrategy {
                 name: "paper",
                 keeps_views: false,
+                adds_pixels: false,
+                gradient_threshold: 2e-4,
                 spreads_growth: false,
                 seeds_depths: false,
             },

@@ -3,7 +3,7 @@
 use nightsplat_core::camera::{Camera, Patch};
 use nightsplat_models::gaussians::{Attribute, Gaussians};
 
-use super::{Damping, Gradients, RenderOptions, Renderer};
+use super::{GradientNorm, Gradients, RenderOptions, Renderer};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::splats::batches::Batches;
@@ -86,9 +86,9 @@ impl Renderer {
     ) -> Result<()> {
         let ViewGradients { parameters, grad_norm_sums, visit_counts, d_render, .. } = gradients;
         let outputs = Gradients { parameters, grad_norm_sums, visit_counts };
-        let damping = Damping { weight: 0.0, depth: 1.0 };
         self.gpu.clone().run("view_gradients", |pass| {
-            self.backward(pass, gaussians, *patch, options, damping, d_render, outputs)
+            let norm = GradientNorm::default();
+            self.backward(pass, gaussians, *patch, options, norm, d_render, outputs)
         })
     }
 }
