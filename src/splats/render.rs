@@ -75,8 +75,8 @@ pub struct RenderOptions {
 /// The norm of a Gaussian's screen-space gradient that density control adds up, in normalised device units.
 #[derive(Clone, Copy, Debug)]
 pub struct GradientNorm {
-    /// The sum of the norms of all pixels, to which fine texture adds; otherwise the norm of their sum, in which it
-    /// cancels.
+    /// The sum of the norms of all pixels, to which fine texture adds (Ye et al. 2024, `AbsGS`); otherwise the norm of
+    /// their sum, in which it cancels (Kerbl et al. 2023, section 5.2).
     pub adds_pixels: bool,
     /// How much of it is damped near the camera, 0 to 1.
     pub damping_weight: f32,

@@ -6,6 +6,7 @@
 pub(crate) mod chain;
 pub(crate) mod command;
 mod files;
+pub(crate) mod grid;
 pub(crate) mod log;
 pub(crate) mod lpips;
 pub(crate) mod png;

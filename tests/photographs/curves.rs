@@ -6,16 +6,8 @@ use nightsplat::kernels::curves::{
 use nightsplat::kernels::{ToneParameters, pseudo_gt};
 use nightsplat_photographs::tone::{FAMILIES, Family, Table, White};
 
+use crate::common::grid::grid;
 use crate::common::prelude::*;
-
-/// A dense grid, including the published values.
-fn grid() -> Vec<f64> {
-    let mut grid: Vec<f64> = (0..=20_000).map(|i| f64::from(i) / 4000.0).collect();
-    grid.extend((-60..=32).map(|power| 10f64.powf(f64::from(power) / 4.0)));
-    grid.extend([1e-12, 0.009_999, 0.01, 0.010_001, 65.0, 1e6, f64::INFINITY]);
-    grid.sort_by(f64::total_cmp);
-    grid
-}
 
 /// The target of a planar photograph on the device, checked against the kernel's reference; `numbers` are those of a
 /// table with `knot_count` knots, or of a profile.

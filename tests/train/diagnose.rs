@@ -135,9 +135,9 @@ fn a_blurred_photograph_and_one_without_a_pose_are_named() {
         Image::from_fn(SIZE[0], SIZE[1], |x, y| {
             let [right, bottom] = SIZE.map(|side| side - 1);
             let steps = 0..9;
-            let places = steps
+            let pixels = steps
                 .map(|step| image.pixel((x + dx * step).min(right), (y + dy * step).min(bottom)));
-            places.fold([0.0; 3], |sum, rgb| std::array::from_fn(|c| sum[c] + rgb[c] / 9.0))
+            pixels.fold([0.0; 3], |sum, rgb| std::array::from_fn(|c| sum[c] + rgb[c] / 9.0))
         })
     };
     edit(&set, |index, image| match index {

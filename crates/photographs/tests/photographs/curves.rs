@@ -4,6 +4,8 @@ use std::collections::BTreeSet;
 
 use nightsplat_photographs::tone::{FAMILIES, Family, ToneCurve};
 
+use crate::grid::grid;
+
 /// The published values after the clamp, as printed.
 const T: [f64; 8] = [0.05, 0.10, 0.25, 0.50, 1.00, 1.50, 2.00, 3.00];
 const VALUES: [(&str, [f64; 8]); 23] = [
@@ -31,15 +33,6 @@ const VALUES: [(&str, [f64; 8]); 23] = [
     ("richards", [1.00; 8]),
     ("softexp", [0.077, 0.149, 0.331, 0.553, 0.800, 0.911, 0.960, 0.992]),
 ];
-
-/// A dense grid, including the published values.
-fn grid() -> Vec<f64> {
-    let mut grid: Vec<f64> = (0..=20_000).map(|i| f64::from(i) / 4000.0).collect();
-    grid.extend((-60..=32).map(|power| 10f64.powf(f64::from(power) / 4.0)));
-    grid.extend([1e-12, 0.009_999, 0.01, 0.010_001, 65.0, 1e6, f64::INFINITY]);
-    grid.sort_by(f64::total_cmp);
-    grid
-}
 
 fn value(family: &Family, t: f64) -> f64 {
     family.curve.value(t, 0.0, 1.0, &family.defaults())

@@ -4,6 +4,8 @@
 
 #[path = "../../../../tests/common/files.rs"]
 mod common;
+#[path = "../../../../tests/common/grid.rs"]
+mod grid;
 #[path = "../../../../tests/common/log.rs"]
 mod log;
 #[path = "../../../../tests/common/png.rs"]
