@@ -37,7 +37,7 @@ impl Reference for Kernel {
         let (inverse, count) = (inverse(params, constants), params.pixel_count as usize);
         for at in 0..count {
             let Some((color, alpha)) = pixel(params, &slices, at) else { continue };
-            for (c, x) in inverse.invert(inverse.shown(color)).rgb.into_iter().enumerate() {
+            for (c, x) in inverse.invert(inverse.shown(color)).into_iter().enumerate() {
                 slices.render[c * count + at] = (x * alpha) as f32;
             }
         }
@@ -52,10 +52,10 @@ impl Reference for Kernel {
             let Some((color, alpha)) = pixel(params, &slices, at) else { continue };
             // Beyond the largest value that is inverted, the solution is that of this value.
             let color = inverse.bounded(inverse.shown(color));
-            let found = inverse.invert(color).rgb;
+            let found = inverse.invert(color);
             let off = [0, 1, 2].map(|c| residual(params, constants, found[c], color[c]));
             let moved = |sign: f64| {
-                inverse.invert(inverse.shown([0, 1, 2].map(|c| color[c] + sign * off[c]))).rgb
+                inverse.invert(inverse.shown([0, 1, 2].map(|c| color[c] + sign * off[c])))
             };
             let (low, high) = (moved(-1.0), moved(1.0));
             for c in 0..3 {

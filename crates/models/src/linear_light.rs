@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 use nightsplat_photographs::image::{Image, linear_from_srgb, srgb_from_linear};
-use nightsplat_photographs::tone::{InverseTone, Inverted};
+use nightsplat_photographs::tone::InverseTone;
 use rayon::prelude::*;
 
 use crate::gaussians::{Gaussians, rest_coefficients};
@@ -14,15 +14,13 @@ pub const STOPS: &str = "nightsplatStops";
 /// An image as a photograph, sRGB-encoded, and the number of its pixels that the curve does not determine.
 pub fn photograph_of(target: &Image, inverse: &InverseTone) -> (Image, usize) {
     let pixels = target.pixel_count();
-    let inverted: Vec<Inverted> = (0..pixels)
-        .into_par_iter()
-        .map(|pixel| {
-            inverse.invert([0, 1, 2].map(|plane| target.data[plane * pixels + pixel].into()))
-        })
-        .collect();
-    let plane = |plane: usize| inverted.iter().map(move |pixel| pixel.rgb[plane] as f32);
+    let at = |pixel: usize| [0, 1, 2].map(|plane| target.data[plane * pixels + pixel].into());
+    let inverted: Vec<[f64; 3]> =
+        (0..pixels).into_par_iter().map(|pixel| inverse.invert(at(pixel))).collect();
+    let plane = |plane: usize| inverted.iter().map(move |pixel| pixel[plane] as f32);
     let data = (0..3).flat_map(plane).collect();
-    (Image { data, ..*target }, inverted.iter().filter(|pixel| pixel.is_clipped).count())
+    let clipped = (0..pixels).filter(|&pixel| inverse.is_clipped(at(pixel))).count();
+    (Image { data, ..*target }, clipped)
 }
 
 /// An image whose linear light is multiplied by `unit`.
@@ -50,10 +48,10 @@ pub fn slope_at(target: &Image, inverse: &InverseTone) -> f64 {
     let pixels = target.pixel_count();
     let squares = |pixel: usize| {
         let value = [0, 1, 2].map(|plane| f64::from(target.data[plane * pixels + pixel]));
-        let [below, above] =
-            [-STEP, STEP].map(|step| inverse.invert(value.map(|value| value + step)));
-        let rise = |c: usize| ((above.rgb[c] - below.rgb[c]) / (2.0 * STEP)).powi(2);
-        (!above.is_clipped).then(|| rise(0) + rise(1) + rise(2))
+        let ends = [-STEP, STEP].map(|step| value.map(|value| value + step));
+        let [below, above] = ends.map(|end| inverse.invert(end));
+        let rise = |c: usize| ((above[c] - below[c]) / (2.0 * STEP)).powi(2);
+        (!inverse.is_clipped(ends[1])).then(|| rise(0) + rise(1) + rise(2))
     };
     let all: Vec<f64> = (0..pixels).into_par_iter().filter_map(squares).collect();
     (3.0 * all.len() as f64 / all.iter().sum::<f64>()).sqrt()
@@ -86,9 +84,10 @@ pub fn linear_gaussians(
             let color: DVec3 =
                 coefficients.iter().zip(basis).map(|(value, basis)| *value * *basis).sum();
             // Renderers cut colours at black.
-            let found = inverse.invert(inverse.shown((color + 0.5).to_array()));
-            is_clipped |= found.is_clipped;
-            let light = found.rgb.map(|x| raised * f64::from(linear_from_srgb(x as f32)));
+            let target = inverse.shown((color + 0.5).to_array());
+            is_clipped |= inverse.is_clipped(target);
+            let light =
+                inverse.invert(target).map(|x| raised * f64::from(linear_from_srgb(x as f32)));
             for (sum, basis) in fitted.iter_mut().zip(basis) {
                 *sum += (DVec3::from_array(light) - 0.5) * *basis * *weight;
             }
@@ -169,7 +168,7 @@ mod tests {
                     let all = std::iter::once(&model.dc()[0]).chain(rest).zip(basis);
                     (all.map(|(c, b)| c.as_dvec3() * b).sum::<DVec3>() + 0.5).to_array()
                 };
-                let expected = inverse.invert(of(&gaussians)).rgb;
+                let expected = inverse.invert(of(&gaussians));
                 let expected = expected.map(|x| 8.0 * f64::from(linear_from_srgb(x as f32)));
                 for (found, expected) in of(&linear).into_iter().zip(expected) {
                     assert!(

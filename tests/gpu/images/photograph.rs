@@ -67,7 +67,7 @@ fn the_light_of_auto_is_the_hosts_inverse_to_a_ten_thousandth_up_to_clipping() {
         let mut most = 0.0_f64;
         for (target, found) in targets.iter().zip(inverted(Tone::Auto.constant(), tone, &targets)) {
             let expected = inverse.invert(inverse.shown(target.map(f64::from)));
-            for (found, expected) in found.into_iter().zip(expected.rgb) {
+            for (found, expected) in found.into_iter().zip(expected) {
                 assert!(found.is_finite());
                 // A code of 16 bits of the photograph, where its target is all but black.
                 let off = ((found - expected).abs() - 1.0 / 65_535.0).max(0.0) / expected.max(1e-9);
@@ -161,7 +161,7 @@ fn in_photographs(law: &SceneLaw, render: &mut [f32], transmittances: &[f32]) {
         let alpha = 1.0 - f64::from(*transmittance);
         if alpha > 0.0 {
             let target = [0, 1, 2].map(|c| f64::from(render[c * PIXELS + at]) / alpha);
-            let back = inverse.invert(inverse.shown(target)).rgb;
+            let back = inverse.invert(inverse.shown(target));
             (0..3).for_each(|c| render[c * PIXELS + at] = (back[c] * alpha) as f32);
         }
     }

@@ -490,7 +490,7 @@ fn a_model_that_states_its_law_is_drawn_as_its_dark_photographs_or_in_their_line
         let target = [0, 1, 2].map(|c| f64::from(planes[c * PIXELS + at]) / alpha.max(1e-9));
         let bytes = dark[at].to_le_bytes();
         let halves = [linear[2 * at], linear[2 * at] >> 16, linear[2 * at + 1]];
-        for (c, x) in inverse.invert(inverse.shown(target)).rgb.into_iter().enumerate() {
+        for (c, x) in inverse.invert(inverse.shown(target)).into_iter().enumerate() {
             let byte = (255.0 * (x * alpha).clamp(0.0, 1.0)).round();
             assert!((f64::from(bytes[c]) - byte).abs() <= 1.0, "{at}: {bytes:?} {byte}");
             let light =

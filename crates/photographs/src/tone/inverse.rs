@@ -38,15 +38,6 @@ pub struct InverseTone {
     largest: [f64; 3],
 }
 
-/// A colour of a photograph, and whether the curve is flat where it was found.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Inverted {
-    /// sRGB-encoded; above 1 where the curve allows, and negative below black.
-    pub rgb: [f64; 3],
-    /// A channel is that of the largest value that is inverted.
-    pub is_clipped: bool,
-}
-
 impl InverseTone {
     /// The inverse of this curve with the parameters of a photograph.
     pub fn new(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {
@@ -161,20 +152,25 @@ impl InverseTone {
         })
     }
 
-    /// The colour of a photograph whose target is this one.
-    pub fn invert(&self, target: [f64; 3]) -> Inverted {
-        let is_clipped = (0..3).any(|channel| target[channel] > self.largest[channel]);
+    /// Whether the curve is flat at a target: a channel of its inverse is that of the largest value that is inverted.
+    pub fn is_clipped(&self, target: [f64; 3]) -> bool {
+        (0..3).any(|channel| target[channel] > self.largest[channel])
+    }
+
+    /// The colour of a photograph whose target is this one, sRGB-encoded: above 1 where the curve allows, and negative
+    /// below black.
+    pub fn invert(&self, target: [f64; 3]) -> [f64; 3] {
         let bounded = self.bounded(target);
         let solved =
             |factor: f64| [0, 1, 2].map(|channel| self.solved(bounded[channel], channel, factor));
         // The factor is 1 for black, where the result is the darkest.
-        let mut rgb = solved(1.0);
+        let darkest = solved(1.0);
         if self.curve.number != CURVE_AUTO || self.curve.constants[0] == 0.0 {
-            return Inverted { rgb, is_clipped };
+            return darkest;
         }
         // Secants of Y - luminance(rgb(Y)), which is negative below the solution.
         let step = |y: f64| luminance(solved(self.factor([y; 3])));
-        let mut y = luminance(rgb);
+        let mut y = luminance(darkest);
         let mut before: Option<[f64; 2]> = None;
         let [mut low, mut high] = [f64::NEG_INFINITY, f64::INFINITY];
         for _ in 0..TRIALS {
@@ -194,14 +190,13 @@ impl InverseTone {
             let is_between = next > low && next < high;
             y = if next * y > 0.0 && is_between { next } else { y + error };
         }
-        rgb = solved(self.factor([y; 3]));
-        Inverted { rgb, is_clipped }
+        solved(self.factor([y; 3]))
     }
 
     /// By how many stops linear light has to be raised for the brightness of the target: for a grey that reflects 18 %.
     pub fn stops_to_target(&self) -> f64 {
         const GREY: f32 = 0.18;
-        let grey = self.invert([srgb_from_linear(GREY).into(); 3]).rgb[1] as f32;
+        let grey = self.invert([srgb_from_linear(GREY).into(); 3])[1] as f32;
         f64::from(GREY / linear_from_srgb(grey)).log2()
     }
 
@@ -261,12 +256,11 @@ mod tests {
             let mut restored = 0;
             for rgb in colours() {
                 let target = inverse.target(rgb);
-                let Inverted { rgb: back, is_clipped } = inverse.invert(target);
-                if is_clipped {
+                if inverse.is_clipped(target) {
                     continue;
                 }
                 restored += 1;
-                for (value, back) in rgb.into_iter().zip(back) {
+                for (value, back) in rgb.into_iter().zip(inverse.invert(target)) {
                     let stops = (linear(back) / linear(value)).log2().abs();
                     assert!(stops < 1e-3, "{curve}: {value} becomes {back}, {stops} stops");
                 }
@@ -282,11 +276,11 @@ mod tests {
             ToneParameters { white: 0.05, offset: 0.075, gain: 1.0, weight: 1.0, constants };
         let inverse = InverseTone::of_curve(CURVE_AUTO, None, &parameters);
         for rgb in colours() {
-            let Inverted { rgb: back, is_clipped } = inverse.invert(inverse.target(rgb));
-            if is_clipped {
+            let target = inverse.target(rgb);
+            if inverse.is_clipped(target) {
                 continue;
             }
-            for (value, back) in rgb.into_iter().zip(back) {
+            for (value, back) in rgb.into_iter().zip(inverse.invert(target)) {
                 let bound = 1e-3 * value + 1.0 / 65_535.0;
                 assert!((back - value).abs() < bound, "{rgb:?}: {value} becomes {back}");
             }
@@ -297,11 +291,12 @@ mod tests {
     fn values_in_the_flat_part_are_counted_and_stay_finite() {
         let inverse = inverse(&ToneSettings::new(Tone::Auto));
         for flat in [[1.0; 3], [2.0, 0.3, 0.3], [0.9999, 0.1, 0.1]] {
-            let Inverted { rgb, is_clipped } = inverse.invert(flat);
-            assert!(is_clipped && rgb.iter().all(|x| x.is_finite()), "{rgb:?}");
+            let rgb = inverse.invert(flat);
+            assert!(inverse.is_clipped(flat) && rgb.iter().all(|x| x.is_finite()), "{rgb:?}");
         }
-        let dark = inverse.invert([f64::NAN, -1.0, 0.0]);
-        assert!(dark.rgb[0] == 0.0 && dark.rgb[1] < dark.rgb[2] && !dark.is_clipped, "{dark:?}");
+        let target = [f64::NAN, -1.0, 0.0];
+        let dark = inverse.invert(target);
+        assert!(dark[0] == 0.0 && dark[1] < dark[2] && !inverse.is_clipped(target), "{dark:?}");
     }
 
     #[test]
