@@ -62,7 +62,7 @@ impl Targets {
         photograph: &Image,
         measured: &MeasuredPhotograph,
     ) -> Result<Image> {
-        self.pseudo_gt.tone_mapped(photograph, &self.scene.mapping_of(measured))
+        self.pseudo_gt.tone_mapped(photograph, &self.scene.curve_of(measured))
     }
 
     /// The target of a view with this photograph, of its camera's size.
@@ -70,8 +70,8 @@ impl Targets {
         let target = match self.external(view)? {
             Some(target) => target,
             None => {
-                let tone_mapping = self.scene.tone_mapping_of(view, photograph)?;
-                self.pseudo_gt.tone_mapped(photograph, &tone_mapping)?
+                let curve = self.scene.curve_of_image(view, photograph)?;
+                self.pseudo_gt.tone_mapped(photograph, &curve)?
             }
         };
         Ok(target.resized(view.camera.width, view.camera.height))

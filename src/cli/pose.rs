@@ -152,7 +152,7 @@ pub(super) fn posed(
 fn tone_mapper(device: &DeviceChoice) -> crate::Result<ToneMapper> {
     let gpu = driver::open(device)?;
     Ok(Box::new(move |scene, photograph, measured| {
-        PseudoGt::new(&gpu, scene.settings())?.tone_mapped(photograph, &scene.mapping_of(measured))
+        PseudoGt::new(&gpu, scene.settings())?.tone_mapped(photograph, &scene.curve_of(measured))
     }))
 }
 

@@ -98,8 +98,8 @@ impl Views {
         let stage = Stage::begin("uploading photographs", photographs(dataset).count());
         for (at, (index, view)) in photographs(dataset).enumerate() {
             stage.next()?;
-            let Some(tone_mapping) = scene.tone_mapping(view)? else { continue };
-            curves.push(tone_mapping.parameters);
+            let Some(curve) = scene.curve_of_view(view)? else { continue };
+            curves.push(curve);
             let Some(image) = view.loaded()? else { continue };
             let loaded_size = UVec2::new(image.width, image.height);
             let sizes = (0..levels.len()).map(|level| shrunk(loaded_size, level as u32));
@@ -109,8 +109,7 @@ impl Views {
             let is_larger = photograph_size
                 .filter(|photograph_size| sizes.iter().any(|size| size != photograph_size));
             let whole = if is_larger.is_some() { view.photograph()? } else { None };
-            let whole =
-                whole.map(|whole| pseudo_gt.tone_mapped(&whole, &tone_mapping)).transpose()?;
+            let whole = whole.map(|whole| pseudo_gt.tone_mapped(&whole, &curve)).transpose()?;
             let whole = targets.external(view)?.or(whole);
             for (views, size) in levels.iter_mut().zip(sizes) {
                 let resized = |whole: &Image| view.blacked_out(whole.resized(size.x, size.y));

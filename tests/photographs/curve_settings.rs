@@ -48,10 +48,10 @@ fn kernels_apply_a_formula_to_a_hundredth_of_a_code_and_its_inverse_undoes_it() 
     let measured = MeasuredPhotograph::measure(&photograph.data);
     for text in ["0.9*t/(t+0.3)", "x^0.45", "1-exp(-1.3*t^0.8)", "min(0.05+0.4*t, 0.9)"] {
         let settings = settings(text);
-        let mapping = SceneTone::new(&settings).mapping_of(&measured);
+        let curve = SceneTone::new(&settings).curve_of(&measured);
         let pseudo_gt = PseudoGt::new(&gpu(), &settings).unwrap();
-        let mapped = pseudo_gt.tone_mapped(&photograph, &mapping).unwrap();
-        let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
+        let mapped = pseudo_gt.tone_mapped(&photograph, &curve).unwrap();
+        let inverse = InverseTone::new(&settings, &curve).unwrap();
         for (&x, &y) in photograph.data.iter().zip(&mapped.data) {
             let t = f64::from(x) / f64::from(measured.statistics.p90);
             let expected = settings.value(t, &measured.statistics);

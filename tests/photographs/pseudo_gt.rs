@@ -4,7 +4,7 @@ use nightsplat::Error;
 use nightsplat::gpu::testing::gpu_that_binds;
 use nightsplat::kernels::ToneParameters;
 use nightsplat_photographs::scene_tone::SceneTone;
-use nightsplat_photographs::tone::{MeasuredPhotograph, ToneMapping};
+use nightsplat_photographs::tone::MeasuredPhotograph;
 
 use crate::common::fixture;
 use crate::common::prelude::*;
@@ -40,12 +40,12 @@ fn a_curve_agrees_with_the_host_from_tiny_to_huge_values() {
     }
 }
 
-/// The tone mapping of a single photograph, and its target on the device.
-fn tone_mapped(gpu: &Gpu, settings: &ToneSettings, photograph: &Image) -> (ToneMapping, Image) {
-    let tone_mapping =
-        SceneTone::new(settings).mapping_of(&MeasuredPhotograph::measure(&photograph.data));
+/// The curve of a single photograph, and its target on the device.
+fn tone_mapped(gpu: &Gpu, settings: &ToneSettings, photograph: &Image) -> (ToneParameters, Image) {
+    let measured = MeasuredPhotograph::measure(&photograph.data);
+    let parameters = SceneTone::new(settings).curve_of(&measured);
     let pseudo_gt = PseudoGt::new(gpu, settings).unwrap();
-    (tone_mapping, pseudo_gt.tone_mapped(photograph, &tone_mapping).unwrap())
+    (parameters, pseudo_gt.tone_mapped(photograph, &parameters).unwrap())
 }
 
 #[test]
@@ -72,11 +72,9 @@ fn a_photograph_maps_on_the_device_as_on_the_host() {
     for path in committed.into_iter().chain(shared("data/lom/chair/low/1.JPG")) {
         let photograph = Image::load(path).unwrap();
         for curve in [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Hybrid] {
-            let (tone_mapping, target) =
-                tone_mapped(&gpu(), &ToneSettings::new(curve), &photograph);
+            let (parameters, target) = tone_mapped(&gpu(), &ToneSettings::new(curve), &photograph);
             let values = photograph.data.iter();
-            let mapped: Vec<f32> =
-                values.map(|&x| curve.apply(x, &tone_mapping.parameters)).collect();
+            let mapped: Vec<f32> = values.map(|&x| curve.apply(x, &parameters)).collect();
             assert_close(curve.name(), &target.data, &mapped, |_, _| 5e-6);
         }
     }

@@ -2,7 +2,7 @@
 //! recorded configuration.
 
 use nightsplat_photographs::dataset::LoadOptions;
-use nightsplat_photographs::scene_tone::{SceneTone, TargetExposure};
+use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{GainChoice, MeasuredPhotograph, Table, Tone};
 
 use crate::common::prelude::*;
@@ -70,38 +70,35 @@ fn the_statistics_of_the_scene_are_measured_over_all_views() {
     assert_ne!(train(&config(settings), &dataset).0, train(&config(scene), &dataset).0);
 }
 
-/// The exposure that training measures in a dataset whose training photographs are scaled, one by one.
-fn exposure(
-    dataset: &Dataset,
-    factors: impl Fn(usize) -> f32,
-) -> nightsplat::Result<TargetExposure> {
+/// What training measures in a dataset whose training photographs are scaled, one by one.
+fn scene(dataset: &Dataset, factors: impl Fn(usize) -> f32) -> nightsplat::Result<SceneTone> {
     let mut dataset = dataset.clone();
     let training = dataset.views.iter_mut().filter(|view| view.is_train());
     for (index, image) in training.filter_map(|view| view.image.as_mut()).enumerate() {
         image.data.iter_mut().for_each(|x| *x = (*x * factors(index)).min(1.0));
     }
     let trainer = Trainer::new(&gpu(), config(ToneSettings::default()), &dataset)?;
-    Ok(trainer.scene().target_exposure(&dataset).unwrap())
+    Ok(trainer.scene().clone())
 }
 
 #[test]
 fn darker_views_get_more_gain_and_the_model_the_mean_of_them() {
     let dataset = crate::common::train::dataset(6, [32, 24]);
-    let uniform = exposure(&dataset, |_| 1.0).unwrap();
-    assert_eq!(uniform.gains.len(), 5);
-    let varied = exposure(&dataset, |index| [1.0, 0.5, 0.25, 2.0, 1.0][index]).unwrap();
-    for ((name, gain), factor) in varied.gains.iter().zip([1.0, 0.5, 0.25, 2.0, 1.0]) {
+    let uniform = scene(&dataset, |_| 1.0).unwrap().gains(&dataset);
+    assert_eq!(uniform.len(), 5);
+    let varied = scene(&dataset, |index| [1.0, 0.5, 0.25, 2.0, 1.0][index]).unwrap();
+    let gains = varied.gains(&dataset);
+    for ((name, gain), factor) in gains.iter().zip([1.0, 0.5, 0.25, 2.0, 1.0]) {
         // The scene's gain follows its brightest views, to which each view contributes.
-        let ratio = gain * factor / uniform.gains[name];
-        assert!((0.75..1.35).contains(&ratio), "{name}: {gain}, {}", uniform.gains[name]);
+        let ratio = gain * factor / uniform[name];
+        assert!((0.75..1.35).contains(&ratio), "{name}: {gain}, {}", uniform[name]);
     }
-    let product: f64 = varied.gains.values().product();
-    assert!((varied.model_gain / product.powf(0.2) - 1.0).abs() < 1e-9);
+    let product: f64 = gains.values().product();
+    assert!((varied.model_gain.unwrap() / product.powf(0.2) - 1.0).abs() < 1e-9);
     let shared = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
     let trainer = Trainer::new(&gpu(), config(shared), &dataset).unwrap();
-    let exposure = trainer.scene().target_exposure(&dataset);
-    let TargetExposure { scene, gains, .. } = exposure.unwrap();
-    assert!(gains.values().all(|&gain| gain == scene.gain));
+    let exposure = trainer.scene().exposure.as_ref().unwrap();
+    assert!(trainer.scene().gains(&dataset).values().all(|&gain| gain == exposure.gain));
 }
 
 #[test]
@@ -113,19 +110,22 @@ fn unusual_datasets_have_a_defined_brightness_or_a_clear_error() {
         let name = single.views[first].name.clone();
         move |view| view.name == name
     });
-    let one = exposure(&single, |_| 1.0).unwrap();
-    assert!((one.model_gain / one.scene.gain - 1.0).abs() < 1e-9 && one.scene.spread == 0.0);
+    let exposure = |scene: &SceneTone| scene.exposure.clone().unwrap();
+    let one = scene(&single, |_| 1.0).unwrap();
+    let (model_gain, one) = (one.model_gain.unwrap(), exposure(&one));
+    assert!((model_gain / one.gain - 1.0).abs() < 1e-9 && one.spread == 0.0);
     // Black views among usable ones are left out of the measurement and use the scene's gain.
-    let with_black = exposure(&dataset, |index| if index < 2 { 0.0 } else { 1.0 }).unwrap();
-    assert_eq!(with_black.scene.black, 2);
-    assert_eq!(with_black.gains.values().next(), Some(&with_black.scene.gain));
-    let error = exposure(&dataset, |_| 0.0).unwrap_err().to_string();
+    let with_black = scene(&dataset, |index| if index < 2 { 0.0 } else { 1.0 }).unwrap();
+    assert_eq!(exposure(&with_black).black, 2);
+    let gains = with_black.gains(&dataset);
+    assert_eq!(gains.values().next(), Some(&exposure(&with_black).gain));
+    let error = scene(&dataset, |_| 0.0).unwrap_err().to_string();
     assert!(error.contains("almost black") && !error.contains('\n'), "{error}");
     // Half of them well lit, then all.
-    let half = exposure(&dataset, |index| if index % 2 == 0 { 8.0 } else { 1.0 }).unwrap();
-    assert!(half.scene.share > 0.9, "{half:?}");
-    let well_lit = exposure(&dataset, |_| 9.0).unwrap();
-    assert_eq!(well_lit.scene.weight(), 0.0, "{}", well_lit.scene.reason());
+    let half = exposure(&scene(&dataset, |index| if index % 2 == 0 { 8.0 } else { 1.0 }).unwrap());
+    assert!(half.share > 0.9, "{half:?}");
+    let well_lit = exposure(&scene(&dataset, |_| 9.0).unwrap());
+    assert_eq!(well_lit.weight(), 0.0, "{}", well_lit.reason());
 }
 
 /// Targets are area means of tone-mapped photographs, not tone-mapped means.
@@ -156,7 +156,7 @@ fn photographs_are_tone_mapped_before_they_are_downscaled() {
         .collect();
     let scene = SceneTone::from_photographs(&settings, &measured).unwrap();
     for ((name, photograph), measured) in photographs.iter().zip(&measured) {
-        let tone_mapped = pseudo_gt.tone_mapped(photograph, &scene.mapping_of(measured)).unwrap();
+        let tone_mapped = pseudo_gt.tone_mapped(photograph, &scene.curve_of(measured)).unwrap();
         tone_mapped.save_png16(folder.join("low").join(format!("{name}.png"))).unwrap();
     }
     let elsewhere = train(&config(ToneSettings::new(ToneCurve::None)), &load(&folder)).0;

@@ -9,12 +9,11 @@ use crate::tone::scene_law;
 mod recorded;
 
 use rayon::prelude::*;
-use serde::Serialize;
 
 use crate::dataset::{Dataset, MeasuredSize, View};
 use crate::image::Image;
 use crate::tone::{
-    Exposure, InverseTone, MeasuredPhotograph, SceneLaw, Statistics, Tone, ToneMapping,
+    Exposure, InverseTone, MeasuredPhotograph, SceneLaw, Statistics, Tone, ToneParameters,
     ToneSettings, all_black,
 };
 use nightsplat_core::camera::Camera;
@@ -31,23 +30,15 @@ pub struct SceneTone {
     pub exposure: Option<Exposure>,
     /// All training photographs as one.
     together: MeasuredPhotograph,
-    /// The geometric mean of the gains of the training photographs, if the curve follows the exposure.
-    model_gain: Option<f64>,
-    /// By the name of the view: of each training photograph, or as recorded.
-    mappings: BTreeMap<String, ToneMapping>,
-    /// Whether the mappings are those of a recorded law, and no photograph is measured for its own.
+    /// The geometric mean of the gains of the training photographs, if the curve follows the exposure: the exposure at
+    /// which the model renders and is scored.
+    pub model_gain: Option<f64>,
+    /// By the name of the view: the curve of each training photograph, or as recorded.
+    curves: BTreeMap<String, ToneParameters>,
+    /// By the name of the view: see [`SceneTone::gain_of`].
+    gains: BTreeMap<String, f64>,
+    /// Whether the curves are those of a recorded law, and no photograph is measured for its own.
     is_recorded: bool,
-}
-
-/// The exposure of the targets and of the model.
-#[derive(Clone, Debug, Serialize)]
-pub struct TargetExposure {
-    /// The geometric mean of the views' gains: the exposure at which the model renders and is scored.
-    pub model_gain: f64,
-    /// The exposure of the training photographs together.
-    pub scene: Exposure,
-    /// The gain of every training view, by name.
-    pub gains: BTreeMap<String, f64>,
 }
 
 /// The training views that have a photograph, with their indices in the dataset.
@@ -65,7 +56,8 @@ impl SceneTone {
             exposure: None,
             together: MeasuredPhotograph::default(),
             model_gain: None,
-            mappings: BTreeMap::new(),
+            curves: BTreeMap::new(),
+            gains: BTreeMap::new(),
             is_recorded: false,
         }
     }
@@ -103,25 +95,29 @@ impl SceneTone {
         }
         let scene = Self::from_photographs(settings, &training);
         let mut scene = scene.ok_or_else(|| all_black(&dataset.root))?;
-        for (view, measured) in views.iter().zip(&training) {
-            scene.mappings.insert(view.name.clone(), scene.mapping_of(measured));
-        }
+        views.iter().zip(&training).for_each(|(view, measured)| scene.add(view, measured));
         scene.model_gain = scene.model_exposure().map(|_| {
-            let gains: Vec<f64> =
-                scene.mappings.values().filter_map(|mapping| mapping.gain.map(f64::ln)).collect();
-            (gains.iter().sum::<f64>() / gains.len().max(1) as f64).exp()
+            let sum: f64 = scene.gains.values().map(|gain| gain.ln()).sum();
+            (sum / scene.gains.len().max(1) as f64).exp()
         });
         Ok(scene)
     }
 
-    /// The law of a dataset: with the tone mapping of every test photograph, too.
+    /// The law of a dataset: with the curve of every test photograph, too.
     pub fn measure_all(settings: &ToneSettings, dataset: &Dataset) -> Result<Self> {
         let mut scene = Self::measure(&ToneSettings { law: None, ..settings.clone() }, dataset)?;
         for view in dataset.views.iter().filter(|view| !view.is_train()) {
-            let mapping = scene.tone_mapping(view)?;
-            scene.mappings.extend(mapping.map(|mapping| (view.name.clone(), mapping)));
+            if let Some(measured) = measured_of(view, settings.full_resolution)? {
+                scene.add(view, &measured);
+            }
         }
         Ok(scene)
+    }
+
+    /// Keeps the curve of a measured photograph, and its gain.
+    fn add(&mut self, view: &View, photograph: &MeasuredPhotograph) {
+        self.curves.insert(view.name.clone(), self.curve_of(photograph));
+        self.gains.extend(self.gain_of(photograph).map(|gain| (view.name.clone(), gain)));
     }
 
     /// The curve and its constants.
@@ -139,16 +135,10 @@ impl SceneTone {
         self.exposure.as_ref().filter(|_| !matches!(self.settings.curve, Tone::Profile(_)))
     }
 
-    /// The exposure of the targets of a dataset's training views; `None` if the curve determines it.
-    pub fn target_exposure(&self, dataset: &Dataset) -> Option<TargetExposure> {
-        let gain = |(_, view): (usize, &View)| {
-            Some((view.name.clone(), self.mappings.get(&view.name)?.gain?))
-        };
-        Some(TargetExposure {
-            model_gain: self.model_gain?,
-            scene: self.model_exposure()?.clone(),
-            gains: photographs(dataset).filter_map(gain).collect(),
-        })
+    /// The gains of a dataset's training views, by name: see [`SceneTone::gain_of`].
+    pub fn gains<'a>(&self, dataset: &'a Dataset) -> BTreeMap<&'a str, f64> {
+        let gain = |(_, view): (usize, &'a View)| Some((&*view.name, *self.gains.get(&view.name)?));
+        photographs(dataset).filter_map(gain).collect()
     }
 
     /// The image from which the target of a view is made: the photograph at full resolution if it is tone-mapped before
@@ -157,57 +147,60 @@ impl SceneTone {
         source(view, self.settings.full_resolution)
     }
 
-    /// The tone mapping of a measured photograph.
-    pub fn mapping_of(&self, photograph: &MeasuredPhotograph) -> ToneMapping {
+    /// The curve of a measured photograph.
+    pub fn curve_of(&self, photograph: &MeasuredPhotograph) -> ToneParameters {
         let MeasuredPhotograph { luminance, camera, .. } = photograph;
-        self.mapping_at(photograph, |exposure| exposure.gain_of(luminance, camera.as_ref()))
+        self.curve_at(photograph, |exposure| exposure.gain_of(luminance, camera.as_ref()))
     }
 
-    /// The tone mapping of a measured photograph, at this gain if the curve follows the exposure.
-    fn mapping_at(
+    /// k of soft(x; k), whose mean luminance the target of a measured photograph has; `None` if its curve does not
+    /// follow the exposure, or it is its own target.
+    pub fn gain_of(&self, photograph: &MeasuredPhotograph) -> Option<f64> {
+        let MeasuredPhotograph { luminance, camera, .. } = photograph;
+        let exposure = self.exposure.as_ref().filter(|exposure| !exposure.is_lit(luminance))?;
+        Some(exposure.gain_of(luminance, camera.as_ref()))
+    }
+
+    /// The curve of a measured photograph, at this gain if it follows the exposure.
+    fn curve_at(
         &self,
         photograph: &MeasuredPhotograph,
         gain: impl FnOnce(&Exposure) -> f64,
-    ) -> ToneMapping {
+    ) -> ToneParameters {
         let statistics = self.statistics.as_ref().unwrap_or(&photograph.statistics);
-        let parameters = self.settings.parameters(statistics);
-        match &self.exposure {
-            None => ToneMapping { parameters, gain: None },
-            Some(exposure) => {
-                let gain = gain(exposure);
-                self.settings.exposed(exposure, parameters, &photograph.luminance, gain)
-            }
-        }
+        let curve = self.settings.parameters(statistics);
+        let Some(exposure) = &self.exposure else { return curve };
+        self.settings.exposed(exposure, curve, &photograph.luminance, gain(exposure))
     }
 
-    /// The tone mapping of a view; `None` without a photograph.
-    pub fn tone_mapping(&self, view: &View) -> Result<Option<ToneMapping>> {
-        if self.is_recorded || self.mappings.contains_key(&view.name) {
+    /// The curve of a view; `None` without a photograph.
+    pub fn curve_of_view(&self, view: &View) -> Result<Option<ToneParameters>> {
+        if self.is_recorded || self.curves.contains_key(&view.name) {
             return self.known(view).map(Some);
         }
         let measured = measured_of(view, self.settings.full_resolution)?;
-        Ok(measured.map(|measured| self.mapping_of(&measured)))
+        Ok(measured.map(|measured| self.curve_of(&measured)))
     }
 
-    /// The tone mapping of a view with this photograph.
-    pub fn tone_mapping_of(&self, view: &View, photograph: &Image) -> Result<ToneMapping> {
+    /// The curve of a view with this photograph.
+    pub fn curve_of_image(&self, view: &View, photograph: &Image) -> Result<ToneParameters> {
         if self.is_recorded {
             return self.known(view);
         }
         let measured = MeasuredPhotograph::measure(&view.counted(photograph)).seen_by(&view.camera);
-        Ok(self.mapping_of(&measured))
+        Ok(self.curve_of(&measured))
     }
 
-    fn known(&self, View { name, .. }: &View) -> Result<ToneMapping> {
+    fn known(&self, View { name, .. }: &View) -> Result<ToneParameters> {
         let missing =
             || Error::Usage(format!("the tone law lacks the view {name}; it is another dataset's"));
-        self.mappings.get(name).copied().ok_or_else(missing)
+        self.curves.get(name).copied().ok_or_else(missing)
     }
 
     /// From the target of a view to its photograph; of a view without one, to what its camera sees.
     pub fn inverse(&self, view: &View) -> Result<InverseTone> {
-        match self.tone_mapping(view)? {
-            Some(mapping) => InverseTone::new(&self.settings, &mapping.parameters),
+        match self.curve_of_view(view)? {
+            Some(curve) => InverseTone::new(&self.settings, &curve),
             None => self.inverse_at(&view.camera),
         }
     }
@@ -215,18 +208,18 @@ impl SceneTone {
     /// The inverse for a camera, at the exposure of the photographs around it: all cameras share one unit of light, as
     /// far as the photographs share an exposure.
     pub fn inverse_at(&self, camera: &Camera) -> Result<InverseTone> {
-        let mapping = self.mapping_at(&self.together, |exposure| exposure.gain_around(camera));
-        InverseTone::new(&self.settings, &mapping.parameters)
+        let curve = self.curve_at(&self.together, |exposure| exposure.gain_around(camera));
+        InverseTone::new(&self.settings, &curve)
     }
 
     /// The inverse of the whole scene, at the exposure of all photographs together.
     pub fn inverse_of_scene(&self) -> Result<InverseTone> {
-        InverseTone::new(&self.settings, &self.mapping_of(&self.together).parameters)
+        InverseTone::new(&self.settings, &self.curve_of(&self.together))
     }
 
     /// The curve of the whole scene, whose inverse is [`SceneTone::inverse_of_scene`].
     pub fn law(&self) -> Result<SceneLaw> {
-        scene_law(&self.settings, &self.mapping_of(&self.together).parameters)
+        scene_law(&self.settings, &self.curve_of(&self.together))
     }
 }
 

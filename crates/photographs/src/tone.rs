@@ -48,7 +48,7 @@ pub use self::file::CurveChoice;
 pub use self::histogram::EMPTY_CHANNEL;
 pub use self::histogram::LuminanceHistogram;
 pub use self::inverse::{InverseTone, scene_law};
-pub use self::mapping::{MeasuredPhotograph, ToneMapping};
+pub use self::mapping::MeasuredPhotograph;
 pub use self::metering::MAX_GAIN;
 pub use self::metering::{CurveEnds, NEAR_WHITE, soft};
 pub use self::profile::{PROFILE_WIDTH, Profile, SEGMENTS, profiled};

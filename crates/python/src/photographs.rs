@@ -80,8 +80,8 @@ pub(crate) fn tone_map<'py>(
         let measured = MeasuredPhotograph::measure(&photograph.data);
         let scene = SceneTone::from_photographs(&tone, std::slice::from_ref(&measured));
         let black = || Error::Usage("the photograph is almost black; expose longer".to_owned());
-        let mapping = scene.ok_or_else(black)?.mapping_of(&measured);
-        PseudoGt::new(&gpu, &tone)?.tone_mapped(&photograph, &mapping)
+        let curve = scene.ok_or_else(black)?.curve_of(&measured);
+        PseudoGt::new(&gpu, &tone)?.tone_mapped(&photograph, &curve)
     })?;
     of_image(py, &mapped)
 }

@@ -380,7 +380,7 @@ impl CurveOnSet {
         let measured =
             known.unwrap_or_else(|| MeasuredPhotograph::measure(&without(photograph, gaps)));
         let image = self.targets.tone_mapped(photograph, &measured)?;
-        let gain = self.targets.scene.mapping_of(&measured).gain;
+        let gain = self.targets.scene.gain_of(&measured);
         let statistics = measured.statistics;
         if listed.split != Some(Split::Test) {
             self.measured.insert(listed.input.clone(), measured);

@@ -45,7 +45,7 @@ pub(super) const HASHES: &str = "hashes.csv";
 /// Settings decided from the photographs, with reasons.
 pub(super) const PLAN: &str = "plan.toml";
 
-/// Key of the [`nightsplat_photographs::scene_tone::TargetExposure`] in `metrics.json`.
+/// Key of the gain of the model, the exposure of the photographs and the gains of the views, in `metrics.json`.
 pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
 
 /// Key of the resources of the steps, other than seconds, in `metrics.json`.

@@ -117,8 +117,11 @@ pub fn train_in(
     let mut metrics = evaluation.json(Some(spent.seconds), Some(gaussians), Some(steps));
     metrics[SPENT] = serde_json::json!(spent);
     eval::add_reference(&mut metrics, &config.tone);
-    if let Some(exposure) = trainer.scene().target_exposure(dataset) {
-        metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
+    let tone = trainer.scene();
+    if let (Some(model_gain), Some(scene)) = (tone.model_gain, tone.model_exposure()) {
+        let gains = tone.gains(dataset);
+        metrics[TARGET_EXPOSURE] =
+            serde_json::json!({ "model_gain": model_gain, "scene": scene, "gains": gains });
     }
     evaluation.add_other_steps(&mut metrics, config.exposure.learn);
     metrics[ENDED] = serde_json::json!(ended);

@@ -1,16 +1,16 @@
 //! Tone-maps photographs on the host, one at a time, in tiles if one exceeds what the device binds.
 
 use nightsplat_photographs::image::Image;
-use nightsplat_photographs::tone::ToneMapping;
 
 use super::PseudoGt;
 use crate::Result;
 use crate::gpu::{Buffer, Download};
+use crate::kernels::ToneParameters;
 
 impl PseudoGt {
     /// The target of a photograph, at its own size.
-    pub fn tone_mapped(&self, photograph: &Image, tone_mapping: &ToneMapping) -> Result<Image> {
-        let parameters = self.gpu.buffer("tone parameters", &[tone_mapping.parameters])?;
+    pub fn tone_mapped(&self, photograph: &Image, curve: &ToneParameters) -> Result<Image> {
+        let parameters = self.gpu.buffer("tone parameters", &[*curve])?;
         let Image { width, height, .. } = *photograph;
         let pixels = photograph.pixel_count();
         let (mut data, mut first) = (vec![0.0; photograph.data.len()], 0);

@@ -148,8 +148,8 @@ fn noise_at_black_keeps_its_mean_through_loading_and_the_target() {
     let auto = ToneSettings::default();
     let curves = [&none, &auto].map(|settings| PseudoGt::new(&gpu, settings).unwrap());
     let lit = [MeasuredPhotograph::measure(&[0.1; 300])];
-    let law = SceneTone::from_photographs(&auto, &lit).unwrap().mapping_of(&lit[0]);
-    let plain = SceneTone::new(&none).mapping_of(&lit[0]);
+    let law = SceneTone::from_photographs(&auto, &lit).unwrap().curve_of(&lit[0]);
+    let plain = SceneTone::new(&none).curve_of(&lit[0]);
     let sigma = SIGMA / f32::from(WHITE - BLACK);
     for is_mosaic in [false, true] {
         for signal in [0.0, 0.25, 0.5, 1.0, 2.0] {
@@ -165,7 +165,7 @@ fn noise_at_black_keeps_its_mean_through_loading_and_the_target() {
                 let image = Image::load(&path).unwrap();
                 let target = curves[0].tone_mapped(&image, &plain).unwrap();
                 let brightened = curves[1].tone_mapped(&image, &law).unwrap();
-                let black = law.parameters.offset;
+                let black = law.offset;
                 for channel in 0..3 {
                     let mean = |values: &[f32], value: fn(f32) -> f32| {
                         let values = &values[256 * channel..][..256];
@@ -187,7 +187,7 @@ fn noise_at_black_keeps_its_mean_through_loading_and_the_target() {
                 assert!((found - f64::from(signal)).abs() < error, "{signal}: {found}");
             }
             // By the slope at black, which the curve has on both sides.
-            let slope = 12.92 * (1.0 - 0.075) / law.parameters.white;
+            let slope = 12.92 * (1.0 - 0.075) / law.white;
             for (channel, found) in bright.into_iter().enumerate() {
                 let one = f64::from(slope * sigma / NEUTRAL[channel]);
                 let found = found / VIEWS as f64 / one;
@@ -278,11 +278,11 @@ fn light_on_the_sensor_comes_back_in_an_exr_through_target_and_inverse() {
     let settings = ToneSettings::default();
     let measured = MeasuredPhotograph::measure(&photograph.data);
     let scene = SceneTone::from_photographs(&settings, std::slice::from_ref(&measured)).unwrap();
-    let mapping = scene.mapping_of(&measured);
+    let curve = scene.curve_of(&measured);
     let pseudo_gt = PseudoGt::new(&gpu(), &settings).unwrap();
-    let target = pseudo_gt.tone_mapped(&photograph, &mapping).unwrap();
+    let target = pseudo_gt.tone_mapped(&photograph, &curve).unwrap();
     assert!(target.pixel(9, 2)[0] > 2.0 * photograph.pixel(9, 2)[0], "the target is brighter");
-    let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
+    let inverse = InverseTone::new(&settings, &curve).unwrap();
     let back = Image::from_fn(28, 8, |x, y| {
         let target = target.pixel(x, y).map(f64::from);
         assert!(!inverse.is_clipped(target), "{x} {y}");

@@ -1,4 +1,4 @@
-//! The tone law of a scene: the tone mapping of every photograph, measured once and recorded in a file.
+//! The tone law of a scene: the curve of every photograph, measured once and recorded in a file.
 //!
 //! Runs on parts of a scene read it instead of measuring their own photographs. So a photograph has the same target in
 //! each of them, and nothing photometric differs where their models meet.
@@ -10,7 +10,7 @@ use nightsplat_core::{Error, Result, output};
 use serde::{Deserialize, Serialize};
 
 use super::SceneTone;
-use crate::tone::{Exposure, ToneMapping, ToneParameters, ToneSettings};
+use crate::tone::{Exposure, ToneParameters, ToneSettings};
 use crate::tree;
 
 /// The version of the file's format.
@@ -62,40 +62,43 @@ impl SceneTone {
         if let Some(exposure) = &mut exposure {
             exposure.request(tone.brightness);
         }
-        let mapping = |(name, text): (String, String)| match parsed(&text) {
-            Some(mapping) => Ok((name, mapping)),
-            None => Err(wrong(format!("a number of {name} is out of range"))),
-        };
-        let mappings = photographs.into_iter().map(mapping).collect::<Result<_>>()?;
-        Ok(Self { exposure, model_gain, mappings, is_recorded: true, ..Self::new(&tone) })
+        let new = Self::new(&tone);
+        let mut law = Self { exposure, model_gain, is_recorded: true, ..new };
+        for (name, text) in photographs {
+            let out_of_range = || wrong(format!("a number of {name} is out of range"));
+            let (gain, curve) = parsed(&text).ok_or_else(out_of_range)?;
+            law.gains.extend(gain.map(|gain| (name.clone(), gain)));
+            law.curves.insert(name, curve);
+        }
+        Ok(law)
     }
 
     /// Writes the law; every number is read back to the bit.
     pub fn save(&self, path: &Path) -> Result<()> {
-        let line = |(name, mapping): (&String, &ToneMapping)| {
-            let gain = mapping.gain.map_or_else(|| NO_GAIN.to_owned(), |gain| gain.to_string());
-            (name.clone(), format!("{gain} {}", mapping.parameters))
+        let line = |(name, curve): (&String, &ToneParameters)| {
+            let gain = self.gains.get(name).map_or_else(|| NO_GAIN.to_owned(), f64::to_string);
+            (name.clone(), format!("{gain} {curve}"))
         };
         let file = File {
             version: VERSION,
             model_gain: self.model_gain,
             tone: self.settings.clone(),
             exposure: self.exposure.clone(),
-            photographs: self.mappings.iter().map(line).collect(),
+            photographs: self.curves.iter().map(line).collect(),
         };
         let text = toml::to_string(&file).map_err(|error| Error::Usage(error.to_string()))?;
         output::write_whole(path, text.as_bytes())
     }
 }
 
-/// `None` if a number is out of range, or there are too many.
-fn parsed(text: &str) -> Option<ToneMapping> {
+/// The gain of a photograph and its curve; `None` if a number is out of range, or there are too many.
+fn parsed(text: &str) -> Option<(Option<f64>, ToneParameters)> {
     let mut words = text.split(' ');
     let gain = match words.next()? {
         NO_GAIN => None,
         gain => Some(gain.parse().ok().filter(|gain: &f64| gain.is_finite() && *gain > 0.0)?),
     };
-    Some(ToneMapping { gain, parameters: ToneParameters::parse(words)? })
+    Some((gain, ToneParameters::parse(words)?))
 }
 
 #[cfg(test)]
@@ -111,10 +114,14 @@ mod tests {
     fn law_of(tone: &ToneSettings) -> SceneTone {
         let measured = [0.05, 0.11, 0.3].map(photograph);
         let scene = SceneTone::from_photographs(tone, &measured).unwrap();
-        let mapping = |(name, one)| (format!("view {name}\""), scene.mapping_of(one));
-        let mappings = (0..).zip(&measured).map(mapping).collect();
-        let model_gain = scene.exposure.as_ref().map(|set_exposure| set_exposure.gain);
-        SceneTone { model_gain, mappings, ..scene }
+        let mut law = scene.clone();
+        law.model_gain = scene.exposure.as_ref().map(|set_exposure| set_exposure.gain);
+        for (at, one) in measured.iter().enumerate() {
+            let name = format!("view {at}\"");
+            law.gains.extend(scene.gain_of(one).map(|gain| (name.clone(), gain)));
+            law.curves.insert(name, scene.curve_of(one));
+        }
+        law
     }
 
     #[test]
@@ -128,14 +135,13 @@ mod tests {
             law.save(&path).unwrap();
             let named = ToneSettings { law: Some(path.clone()), ..tone };
             let read = SceneTone::recorded(&named).unwrap().unwrap();
-            assert_eq!(read.mappings.len(), 3);
-            for (read, written) in read.mappings.values().zip(law.mappings.values()) {
-                assert_eq!(
-                    bytemuck::bytes_of(&read.parameters),
-                    bytemuck::bytes_of(&written.parameters)
-                );
-                assert_eq!(read.gain.map(f64::to_bits), written.gain.map(f64::to_bits));
+            assert_eq!(read.curves.len(), 3);
+            for (read, written) in read.curves.values().zip(law.curves.values()) {
+                assert_eq!(bytemuck::bytes_of(read), bytemuck::bytes_of(written));
             }
+            let bits =
+                |scene: &SceneTone| Vec::from_iter(scene.gains.values().map(|k| k.to_bits()));
+            assert_eq!(bits(&read), bits(&law));
             assert_eq!(read.exposure.map(|one| one.reason()), law.exposure.map(|one| one.reason()));
             assert_eq!(read.model_gain, law.model_gain);
         }

@@ -23,16 +23,6 @@ const GAINS: [f64; 2] = [1.0, 6.0];
 /// Minimum and maximum of a solved gain.
 const STRENGTHS: [f64; 2] = [1e-3, 1e4];
 
-/// How a photograph is tone-mapped to its target.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ToneMapping {
-    /// The curve.
-    pub parameters: ToneParameters,
-    /// k of soft(x; k), whose mean luminance the target has, if it follows from the exposure and the photograph is not
-    /// its own target.
-    pub gain: Option<f64>,
-}
-
 /// Measurements of a photograph.
 #[derive(Clone, Debug, Default)]
 pub struct MeasuredPhotograph {
@@ -216,7 +206,7 @@ impl ToneSettings {
         Statistics { p10: 1.0, p80: theta, p90: 1.0, ..means }
     }
 
-    /// The tone mapping at a gain that follows from the exposure.
+    /// The curve at a gain that follows from the exposure.
     #[doc(hidden)]
     pub fn exposed(
         &self,
@@ -224,16 +214,15 @@ impl ToneSettings {
         parameters: ToneParameters,
         luminance: &LuminanceHistogram,
         gain: f64,
-    ) -> ToneMapping {
+    ) -> ToneParameters {
         let strength = match self.curve {
             Tone::Auto | Tone::Profile(_) => gain,
             _ => self.strength(&parameters, luminance, gain),
         };
-        let is_lit = exposure.is_lit(luminance);
         let weight = match self.curve {
             // A profile applies to bright photographs, too.
             Tone::Profile(_) => 1.0,
-            _ if is_lit => 0.0,
+            _ if exposure.is_lit(luminance) => 0.0,
             _ => exposure.weight(),
         };
         let mut constants = parameters.constants;
@@ -246,8 +235,7 @@ impl ToneSettings {
             constants[1..4].copy_from_slice(&[shoulder, toe, toe_weight].map(|end| end as f32));
         }
         let (white, weight) = ((1.0 / strength) as f32, weight as f32);
-        let parameters = ToneParameters { white, gain: 1.0, weight, constants, ..parameters };
-        ToneMapping { parameters, gain: Some(gain).filter(|_| !is_lit) }
+        ToneParameters { white, gain: 1.0, weight, constants, ..parameters }
     }
 
     /// The factor on x that gives the curve the mean luminance of soft(x; gain).

@@ -330,9 +330,9 @@ fn lit_photographs_among_dark_ones_are_targets_and_set_the_brightness_of_the_oth
     let measured = [&dark, &lit].map(|view| MeasuredPhotograph::measure(view));
     let all = [0, 1, 0, 1, 0].map(|at: usize| measured[at].clone());
     let scene = SceneTone::from_photographs(&settings, &all).unwrap();
-    let [dark, lit] = measured.each_ref().map(|one| scene.mapping_of(one));
-    assert_eq!((lit.parameters.weight, lit.gain), (0.0, None));
-    assert_eq!(dark.parameters.weight, 1.0);
+    let [dark, lit] = measured.each_ref().map(|one| scene.curve_of(one));
+    assert_eq!([dark.weight, lit.weight], [1.0, 0.0]);
+    assert_eq!(scene.gain_of(&measured[1]), None);
     // Neither one of a kind, nor a narrow gap, nor a requested brightness separates them.
     for views in [&views[..2], &[views[0].clone(), views[2].clone()]] {
         assert_eq!(Exposure::measure(views, None).unwrap().lit, 0);
