@@ -4,7 +4,7 @@ use nightsplat::kernels::curves::{
     CURVE_ASE, CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_PROFILE, CURVE_TABLE,
 };
 use nightsplat::kernels::{ToneParameters, pseudo_gt};
-use nightsplat_photographs::tone::{FAMILIES, Family, Table, White};
+use nightsplat_photographs::tone::{FAMILIES, Family, Table};
 
 use crate::common::grid::grid;
 use crate::common::prelude::*;
@@ -65,9 +65,8 @@ fn bound(family: &Family, t: f32, exact: f64) -> f64 {
 #[test]
 fn the_device_agrees_with_every_family_in_double_precision() {
     let grid: Vec<f32> = grid().into_iter().map(|t| t as f32).collect();
-    let is_of_one_value = |family: &&Family| {
-        family.white != White::ChannelMeans && family.curve != ToneCurve::LumPreserve
-    };
+    let is_of_one_value =
+        |family: &&Family| !matches!(family.curve, ToneCurve::PerChannel | ToneCurve::LumPreserve);
     for family in FAMILIES.iter().filter(is_of_one_value) {
         let constants = ToneSettings::new(family.curve).constants;
         let mut padded = [0.0; 8];
@@ -140,9 +139,8 @@ fn curves_that_mix_channels_match_their_reference() {
 fn every_curve_goes_on_below_black_as_its_mirror_image() {
     let above = [1e-6_f32, 1e-3, 0.01, 0.05, 0.3, 0.9];
     let grid = [&above.map(|x| -x)[..], &[0.0], &above].concat();
-    let is_of_one_value = |family: &&Family| {
-        family.white != White::ChannelMeans && family.curve != ToneCurve::LumPreserve
-    };
+    let is_of_one_value =
+        |family: &&Family| !matches!(family.curve, ToneCurve::PerChannel | ToneCurve::LumPreserve);
     for family in FAMILIES.iter().filter(is_of_one_value) {
         let mut tone = ToneParameters { white: 0.4, offset: 0.1, gain: 0.8, ..Default::default() };
         (tone.weight, tone.constants[0]) = (1.0, 0.0);

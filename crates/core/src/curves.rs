@@ -16,7 +16,7 @@ pub use self::catalogue::*;
 pub use self::curve::{
     Curve, Variable, bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve,
 };
-pub use self::families::{Constant, Family, White, padded};
+pub use self::families::{Constant, Family, padded};
 pub use self::real::{Dual, LARGEST_T, Real, within};
 pub use self::scene_law::SceneLaw;
 use crate::settings::distance;

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use nightsplat_core::{Error, Result};
 use nightsplat_photographs::tone::{
-    Constant, Curve, Dual, Expression, Real, Statistics, Tone, ToneSettings, Variable, White,
+    Constant, Curve, Dual, Expression, Real, Statistics, Tone, ToneCurve, ToneSettings, Variable,
     clamped,
 };
 
@@ -70,18 +70,15 @@ impl FitModel {
         }
         let mut slots: Vec<Variable> =
             (0..initial.constants.len()).map(Variable::Constant).collect();
-        match initial.white() {
-            White::One => {}
-            White::P90 if options.adapt || initial.alpha > 0.0 || initial.gain_c > 0.0 => {
+        if curve.is_of_t() {
+            if options.adapt || initial.alpha > 0.0 || initial.gain_c > 0.0 {
                 slots.extend([Variable::Alpha, Variable::GainC]);
                 if family.is_some_and(|family| family.is_rescaled) {
                     slots.push(Variable::BaseGain);
                 }
             }
-            White::P90 => {}
-            White::Mean | White::P80 | White::MeanLuminance | White::ChannelMeans => {
-                slots.push(Variable::Theta);
-            }
+        } else if family.is_some_and(|family| family.curve != ToneCurve::None) {
+            slots.push(Variable::Theta);
         }
         if slots.is_empty() {
             return Err(Error::Usage(format!("the curve `{curve}` has no constants to fit")));
@@ -104,12 +101,12 @@ impl FitModel {
     /// Whether photographs with different statistics have different curves of t.
     pub(super) fn differs_by_photograph(&self) -> bool {
         let is_shared = |slot: &Variable| matches!(slot, Variable::Constant(_));
-        self.initial.white() == White::One || !self.slots.iter().all(is_shared)
+        !self.initial.curve.is_of_t() || !self.slots.iter().all(is_shared)
     }
 
     /// Whether the channels of a photograph have different curves.
     pub(super) fn differs_by_channel(&self) -> bool {
-        self.initial.white() == White::ChannelMeans
+        self.initial.curve == ToneCurve::PerChannel
     }
 
     /// Whether the shape f has constants; otherwise the curve rises for any black level, white and gain.
@@ -185,7 +182,7 @@ impl<'a, T: Real> CurveOfT<'a, T> {
         number: impl Fn(Variable, f64) -> T,
     ) -> Self {
         let mut curve = settings.curve_of(&exposure.statistics, number);
-        if settings.white() == White::ChannelMeans {
+        if settings.curve == ToneCurve::PerChannel {
             curve.white = curve.constants[exposure.channel];
         }
         Self { p90: exposure.p90(), curve, expression }
@@ -241,7 +238,7 @@ pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nightsplat_photographs::tone::{FAMILIES, ToneCurve};
+    use nightsplat_photographs::tone::FAMILIES;
 
     #[test]
     fn every_family_agrees_with_the_kernels() {
@@ -284,7 +281,7 @@ mod tests {
             channel_means: [0.14; 3],
         };
         let exposure = ChannelExposure::new(statistics, 1);
-        let families = FAMILIES.iter().filter(|family| family.white != White::One);
+        let families = FAMILIES.iter().filter(|family| family.curve != ToneCurve::None);
         let of_ones_own = "a*t^b/(t^b+exp(-c*t)); c = 0.3".parse().unwrap();
         let curves = families.map(|family| Tone::Formula(family.curve)).chain([of_ones_own]);
         for curve in curves {

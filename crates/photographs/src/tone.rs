@@ -37,7 +37,7 @@ use std::str::FromStr;
 use nightsplat_core::curves::{CURVE_AUTO, CURVE_NONE, CURVE_PROFILE, CURVE_TABLE, name_of};
 pub use nightsplat_core::curves::{
     Constant, Constants, Curve, Dual, FAMILIES, Family, Real, SceneLaw, ToneCurve, ToneParameters,
-    Variable, White, bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve,
+    Variable, bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve,
 };
 use nightsplat_core::{Error, Result};
 
@@ -127,6 +127,17 @@ impl Tone {
             Self::Expression(_) | Self::Table(_) => CURVE_TABLE,
             Self::Profile(_) => CURVE_PROFILE,
             Self::External(_) => CURVE_NONE,
+        }
+    }
+
+    /// Whether it is a function of t = x / p90.
+    #[doc(hidden)]
+    pub fn is_of_t(&self) -> bool {
+        match self {
+            Self::Formula(curve) => curve.family().is_of_t,
+            Self::Expression(expression) => !expression.is_of_stored(),
+            Self::Table(table) => !table.is_of_stored,
+            Self::Auto | Self::Profile(_) | Self::External(_) => false,
         }
     }
 

@@ -7,7 +7,7 @@ use std::borrow::Cow;
 use std::f64::consts::FRAC_PI_2;
 
 use super::real::Real;
-use super::{Constant, Family, MAX_CONSTANTS, White};
+use super::{Constant, Family, MAX_CONSTANTS};
 
 const CODE: &str =
     "adaptive tone curves for 3DGS, the appendix's leaderboard, constants of its code";
@@ -26,7 +26,7 @@ const FITTED: Family = Family {
     bounded: false,
     identifiable: true,
     is_rescaled: false,
-    white: White::P90,
+    is_of_t: true,
     alpha: 0.0,
     gain_c: 0.0,
 };
@@ -99,7 +99,7 @@ macro_rules! families {
 families! {
     None = CURVE_NONE: "none",
         "x: the photograph as it is",
-        [] { source: "no curve at all, for comparison", white: White::One },
+        [] { source: "no curve at all, for comparison", is_of_t: false },
         |t| t;
 
     Linear = CURVE_LINEAR: "linear",
@@ -107,7 +107,7 @@ families! {
         [] {
             aliases: &["mean_hard"],
             source: "the paper's linear baseline",
-            white: White::Mean,
+            is_of_t: false,
         },
         |t| t;
 
@@ -438,17 +438,17 @@ families! {
             aliases: &["p80_softexp"],
             source: MODE,
             bounded: true,
-            white: White::P80,
+            is_of_t: false,
         },
         |t| t.one_minus_exp();
 
     LumPreserve = CURVE_LUM_PRESERVE: "lum_preserve",
         "x (Y gain) / (Y + 1e-6), gain = theta / mean(Y) from 1 to 6, Y the pixel's luminance",
-        [] { source: MODE, white: White::MeanLuminance },
+        [] { source: MODE, is_of_t: false },
         |t| t;
 
     PerChannel = CURVE_PER_CHANNEL: "per_channel",
         "x theta / (mean(x) + 1e-6), each channel by its own mean",
-        [] { source: MODE, white: White::ChannelMeans },
+        [] { source: MODE, is_of_t: false },
         |t| t;
 }

@@ -6,23 +6,6 @@ use super::real::{Dual, Real, within};
 
 use super::catalogue::{Constants, FAMILIES, ToneCurve, curve_shape};
 
-/// The value that t = 1 corresponds to.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum White {
-    /// 1: t is the photograph's value.
-    One,
-    /// The mean over all channels, divided by theta.
-    Mean,
-    /// The 90th percentile of the luminance.
-    P90,
-    /// 1 / gain with the gain theta / p80, limited to 1 to 6.
-    P80,
-    /// One gain for the luminance, theta over its mean, limited to 1 to 6.
-    MeanLuminance,
-    /// Each channel's mean divided by theta.
-    ChannelMeans,
-}
-
 /// A constant of a formula.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Constant {
@@ -62,8 +45,8 @@ pub struct Family {
     /// Whether black level and gain rescale the shape, delta0 + (1 - delta0) f(g t) with g = g0 + c Y as ASE; else it
     /// is delta0 + b f(t) with b = 1 + c Y, as AP3.
     pub is_rescaled: bool,
-    /// The value that t = 1 corresponds to.
-    pub white: White,
+    /// Whether it is a function of t = x / p90; else its formula says what it makes of x.
+    pub is_of_t: bool,
     /// alpha, the highest black level, by default.
     pub alpha: f64,
     /// c, the gain per mean luminance, by default.

@@ -7,7 +7,7 @@ use nightsplat_fit::{
     Channels, CurveFit, FitOptions, FitScene, Pair, Weighting, cross_validate, fit, psnr,
 };
 use nightsplat_photographs::image::Image;
-use nightsplat_photographs::tone::{FAMILIES, Family, Statistics, ToneCurve, ToneSettings, White};
+use nightsplat_photographs::tone::{FAMILIES, Family, Statistics, ToneCurve, ToneSettings};
 
 use crate::common::shared;
 use crate::pairs::{dark, reference, truth};
@@ -21,9 +21,9 @@ fn fit_to(family: &'static Family, pairs: &[Pair], options: &FitOptions) -> Curv
 }
 
 fn fitted_on_t() -> impl Iterator<Item = &'static Family> {
-    FAMILIES.iter().filter(|family| {
-        family.white == White::P90 && !family.constants.is_empty() && family.gain_c == 0.0
-    })
+    FAMILIES
+        .iter()
+        .filter(|family| family.is_of_t && !family.constants.is_empty() && family.gain_c == 0.0)
 }
 
 const PLAIN: FitOptions = FitOptions {
@@ -85,13 +85,13 @@ fn black_level_gain_and_target_mean_are_recovered_for_adaptive_curves() {
             )
         })
         .collect();
-    for family in FAMILIES.iter().filter(|family| family.white != White::One) {
-        let adapts = family.white != White::P90 || family.gain_c > 0.0 || family.alpha > 0.0;
+    for family in FAMILIES.iter().filter(|family| family.curve != ToneCurve::None) {
+        let adapts = !family.is_of_t || family.gain_c > 0.0 || family.alpha > 0.0;
         if !adapts {
             continue;
         }
         let mut truth = ToneSettings { theta: 0.42, ..ToneSettings::new(family.curve) };
-        if family.white == White::P90 {
+        if family.is_of_t {
             (truth.alpha, truth.gain_c) = (0.1, 1.7);
             if family.is_rescaled {
                 truth.base_gain = 0.9;

@@ -3,7 +3,9 @@
 use std::borrow::Cow;
 
 use nightsplat_core::camera::Camera;
-use nightsplat_core::curves::{Constants, Curve, Real, Variable, White, clamped, curve_at, padded};
+use nightsplat_core::curves::{
+    Constants, Curve, Real, ToneCurve, Variable, clamped, curve_at, padded,
+};
 use nightsplat_core::image::{linear_from_srgb, srgb_from_linear};
 
 use super::exposure::Exposure;
@@ -106,22 +108,25 @@ impl ToneSettings {
         let given = padded(&self.constants);
         let mut constants: Constants<T> =
             std::array::from_fn(|index| number(Variable::Constant(index), given[index]));
-        let [white, offset, gain] = match self.white() {
-            White::One => [one, zero, one],
-            White::Mean => {
+        let [white, offset, gain] = match &self.curve {
+            Tone::Formula(ToneCurve::Linear) => {
                 let white = measured(statistics.mean) / theta;
                 [white.at_least(T::from_f64(MIN_WHITE)), zero, one]
             }
-            White::MeanLuminance => [one, zero, bounded_gain(mean_luminance + epsilon)],
-            White::ChannelMeans => {
+            Tone::Formula(ToneCurve::LumPreserve) => {
+                [one, zero, bounded_gain(mean_luminance + epsilon)]
+            }
+            Tone::Formula(ToneCurve::PerChannel) => {
                 for (white, mean) in constants.iter_mut().zip(statistics.channel_means) {
                     *white = (measured(mean) + epsilon) / theta;
                 }
                 [one, zero, one]
             }
-            White::P80 => [one / bounded_gain(measured(statistics.p80)), zero, one],
-            White::P90 => {
-                let is_rescaled = self.curve.family().is_some_and(|family| family.is_rescaled);
+            Tone::Formula(ToneCurve::P80) => {
+                [one / bounded_gain(measured(statistics.p80)), zero, one]
+            }
+            curve if curve.is_of_t() => {
+                let is_rescaled = curve.family().is_some_and(|family| family.is_rescaled);
                 let least =
                     if is_rescaled { number(Variable::BaseGain, self.base_gain) } else { one };
                 let alpha = number(Variable::Alpha, self.alpha);
@@ -131,6 +136,7 @@ impl ToneSettings {
                     least + number(Variable::GainC, self.gain_c) * mean_luminance,
                 ]
             }
+            _ => [one, zero, one],
         };
         Curve { number: self.curve.constant(), white, offset, gain, constants }
     }
@@ -159,28 +165,13 @@ impl ToneSettings {
         ToneParameters { white, offset, gain, weight: 1.0, constants }
     }
 
-    /// The value that t = 1 corresponds to.
-    #[doc(hidden)]
-    pub fn white(&self) -> White {
-        match &self.curve {
-            Tone::Formula(curve) => curve.family().white,
-            Tone::Table(table) if !table.is_of_stored => White::P90,
-            Tone::Expression(expression) if !expression.is_of_stored() => White::P90,
-            Tone::Expression(_)
-            | Tone::Table(_)
-            | Tone::Auto
-            | Tone::Profile(_)
-            | Tone::External(_) => White::One,
-        }
-    }
-
     /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics. A table of three channels, or a
     /// profile, is evaluated for green, `lum_preserve` and `per_channel` for grey.
     #[doc(hidden)]
     pub fn value(&self, t: f64, statistics: &Statistics) -> f64 {
         let grey = Statistics { channel_means: [statistics.mean; 3], ..*statistics };
         let ToneParameters { mut white, offset, gain, constants, .. } = self.parameters(&grey);
-        if self.white() == White::ChannelMeans {
+        if self.curve == ToneCurve::PerChannel {
             white = constants[0];
         }
         // Without a scene that determines k: a function of k x.

@@ -11,7 +11,7 @@ use nightsplat_core::{Error, Result};
 use serde::{Deserialize, Serialize};
 
 use super::metering::BLACK_LEVEL;
-use super::{Constant, Profile, Table, Tone, ToneCurve, White};
+use super::{Constant, Profile, Table, Tone, ToneCurve};
 
 /// lambda by default: the reference images keep more of the colours than single curves do.
 const COLOUR: f64 = 1.0 / 3.0;
@@ -211,8 +211,8 @@ impl ToneSettings {
     /// Whether the curve raises black by delta0.
     #[doc(hidden)]
     pub fn has_black_level(&self) -> bool {
-        let is_of_p90 = self.curve.family().is_some_and(|family| family.white == White::P90);
-        self.alpha > 0.0 && (is_of_p90 || self.curve == Tone::Auto)
+        let is_of_t = self.curve.family().is_some_and(|family| family.is_of_t);
+        self.alpha > 0.0 && (is_of_t || self.curve == Tone::Auto)
     }
 
     /// Whether the gain follows from the photographs' [`super::Exposure`].
