@@ -13,9 +13,7 @@ use std::str::FromStr;
 use bytemuck::{Pod, Zeroable};
 
 pub use self::catalogue::*;
-pub use self::curve::{
-    Curve, Variable, bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve,
-};
+pub use self::curve::{Curve, bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve};
 pub use self::families::{Constant, Family, padded};
 pub use self::real::{Dual, LARGEST_T, Real, within};
 pub use self::scene_law::SceneLaw;

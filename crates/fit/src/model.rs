@@ -4,27 +4,32 @@ use std::borrow::Cow;
 
 use nightsplat_core::{Error, Result};
 use nightsplat_photographs::tone::{
-    Constant, Curve, Dual, Expression, Real, Statistics, Tone, ToneCurve, ToneSettings, Variable,
-    clamped,
+    ALPHA, BASE_GAIN, Constant, Curve, CurveNumbers, Dual, Expression, GAIN_C, Real, Statistics,
+    THETA, Tone, ToneCurve, ToneSettings, clamped,
 };
 
 use super::{FitOptions, Pair};
 
-/// A setting that is not among a family's constants; it starts at the family's value.
+/// A setting that is not among the constants of a formula; it starts at the curve's value.
 const fn setting(name: &'static str, low: f64, high: f64) -> Constant {
     Constant { name: Cow::Borrowed(name), default: low, start: low, bounds: [low, high] }
 }
-const THETA: Constant = setting("theta", 0.05, 1.0);
-const ALPHA: Constant = setting("alpha", 0.0, 0.5);
-const GAIN_C: Constant = setting("gain_c", 0.0, 20.0);
-const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
+
+/// Those after the constants, in the order of [`CurveNumbers`].
+const SETTINGS: [Constant; 4] = [
+    setting("theta", 0.05, 1.0),
+    setting("alpha", 0.0, 0.5),
+    setting("gain_c", 0.0, 20.0),
+    setting("base_gain", 0.1, 10.0),
+];
 
 /// A curve with the list of its fitted values.
 #[derive(Clone, Debug)]
 pub(super) struct FitModel {
     /// With the curve's own constants.
     pub(super) initial: ToneSettings,
-    slots: Vec<Variable>,
+    /// The positions of the fitted values among the numbers of the curve.
+    slots: Vec<usize>,
     /// In the order of every vector of values.
     pub(super) free: Vec<Constant>,
 }
@@ -68,40 +73,34 @@ impl FitModel {
                 "`{curve}` has no black level and gain to adapt; make them constants of the formula"
             )));
         }
-        let mut slots: Vec<Variable> =
-            (0..initial.constants.len()).map(Variable::Constant).collect();
+        let mut slots: Vec<usize> = (0..initial.constants.len()).collect();
         if curve.is_of_t() {
             if options.adapt || initial.alpha > 0.0 || initial.gain_c > 0.0 {
-                slots.extend([Variable::Alpha, Variable::GainC]);
+                slots.extend([ALPHA, GAIN_C]);
                 if family.is_some_and(|family| family.is_rescaled) {
-                    slots.push(Variable::BaseGain);
+                    slots.push(BASE_GAIN);
                 }
             }
         } else if family.is_some_and(|family| family.curve != ToneCurve::None) {
-            slots.push(Variable::Theta);
+            slots.push(THETA);
         }
         if slots.is_empty() {
             return Err(Error::Usage(format!("the curve `{curve}` has no constants to fit")));
         }
-        let starting_at =
-            |constant: Constant, value: f64| Constant { default: value, start: value, ..constant };
-        let free = slots.iter().map(|&slot| match slot {
-            Variable::Constant(index) => {
-                let constant = curve.constants()[index].clone();
-                Constant { default: initial.constants[index], ..constant }
+        let numbers = initial.numbers();
+        let free = slots.iter().map(|&slot| match curve.constants().get(slot) {
+            Some(constant) => Constant { default: numbers[slot], ..constant.clone() },
+            None => {
+                let setting = SETTINGS[slot - THETA].clone();
+                Constant { default: numbers[slot], start: numbers[slot], ..setting }
             }
-            Variable::Theta => starting_at(THETA, initial.theta),
-            Variable::Alpha => starting_at(ALPHA, initial.alpha),
-            Variable::GainC => starting_at(GAIN_C, initial.gain_c),
-            Variable::BaseGain => starting_at(BASE_GAIN, initial.base_gain),
         });
         Ok(Self { free: free.collect(), initial, slots })
     }
 
     /// Whether photographs with different statistics have different curves of t.
     pub(super) fn differs_by_photograph(&self) -> bool {
-        let is_shared = |slot: &Variable| matches!(slot, Variable::Constant(_));
-        !self.initial.curve.is_of_t() || !self.slots.iter().all(is_shared)
+        !self.initial.curve.is_of_t() || self.slots.iter().any(|&slot| slot >= THETA)
     }
 
     /// Whether the channels of a photograph have different curves.
@@ -116,33 +115,28 @@ impl FitModel {
 
     /// The curve with these values.
     pub(super) fn settings(&self, values: &[f64]) -> ToneSettings {
-        let mut settings = self.initial.clone();
-        for (&slot, &value) in self.slots.iter().zip(values) {
-            match slot {
-                Variable::Constant(index) => settings.constants[index] = value,
-                Variable::Theta => settings.theta = value,
-                Variable::Alpha => settings.alpha = value,
-                Variable::GainC => settings.gain_c = value,
-                Variable::BaseGain => settings.base_gain = value,
-            }
-        }
-        settings
+        self.initial.with_numbers(&self.numbers(values))
+    }
+
+    /// The numbers of the curve with these values.
+    fn numbers(&self, values: &[f64]) -> CurveNumbers<f64> {
+        let mut numbers = self.initial.numbers();
+        self.slots.iter().zip(values).for_each(|(&slot, &value)| numbers[slot] = value);
+        numbers
     }
 
     /// The curve of a photograph of this exposure with these values.
     pub(super) fn curve(&self, values: &[f64], exposure: &ChannelExposure) -> CurveOfT<'_, f64> {
-        let settings = self.settings(values);
-        CurveOfT::new(&settings, expression(&self.initial), exposure, |_, value| value)
+        CurveOfT::new(&self.initial, exposure, &self.numbers(values))
     }
 
     /// [`Self::curve`] with its derivatives with respect to every value.
     pub(super) fn slopes(&self, values: &[f64], exposure: &ChannelExposure) -> Slopes<'_> {
-        let settings = self.settings(values);
-        let by = |&variable: &Variable| {
-            CurveOfT::new(&settings, expression(&self.initial), exposure, |of, value| {
-                let derivative = f64::from(u8::from(of == variable));
-                Dual { value, derivative }
-            })
+        let numbers = self.numbers(values).map(Dual::from_f64);
+        let by = |&slot: &usize| {
+            let mut numbers = numbers;
+            numbers[slot].derivative = 1.0;
+            CurveOfT::new(&self.initial, exposure, &numbers)
         };
         Slopes(self.slots.iter().map(by).collect())
     }
@@ -157,14 +151,6 @@ pub(super) fn own_settings(curve: &Tone) -> ToneSettings {
     settings
 }
 
-/// The formula of one's own, if the curve is one.
-fn expression(settings: &ToneSettings) -> Option<&Expression> {
-    match &settings.curve {
-        Tone::Expression(expression) => Some(expression),
-        _ => None,
-    }
-}
-
 /// The curve of a photograph, or of one of its channels, as a function of t = x / p90.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct CurveOfT<'a, T> {
@@ -176,15 +162,18 @@ pub(super) struct CurveOfT<'a, T> {
 
 impl<'a, T: Real> CurveOfT<'a, T> {
     fn new(
-        settings: &ToneSettings,
-        expression: Option<&'a Expression>,
+        settings: &'a ToneSettings,
         exposure: &ChannelExposure,
-        number: impl Fn(Variable, f64) -> T,
+        numbers: &CurveNumbers<T>,
     ) -> Self {
-        let mut curve = settings.curve_of(&exposure.statistics, number);
+        let mut curve = settings.curve_of(&exposure.statistics, numbers);
         if settings.curve == ToneCurve::PerChannel {
             curve.white = curve.constants[exposure.channel];
         }
+        let expression = match &settings.curve {
+            Tone::Expression(expression) => Some(expression),
+            _ => None,
+        };
         Self { p90: exposure.p90(), curve, expression }
     }
 
@@ -228,7 +217,7 @@ pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
     let [mut count, mut squares] = [0.0; 2];
     for (channel, histogram) in pair.channels.iter().enumerate() {
         let exposure = ChannelExposure::new(pair.statistics, channel);
-        let curve = CurveOfT::new(settings, expression(settings), &exposure, |_, value| value);
+        let curve = CurveOfT::new(settings, &exposure, &settings.numbers());
         squares += histogram.residuals(|x| curve.at(x / exposure.p90()))[1];
         count += histogram.count();
     }
@@ -256,7 +245,7 @@ mod tests {
             for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
                 for channel in 0..3 {
                     let exposure = ChannelExposure::new(statistics, channel);
-                    let curve = CurveOfT::new(&settings, None, &exposure, |_, value| value);
+                    let curve = CurveOfT::new(&settings, &exposure, &settings.numbers());
                     let found = curve.at(x / exposure.p90());
                     let expected = if family.curve == ToneCurve::PerChannel {
                         clamped(x as f32 / parameters.constants[channel])

@@ -37,7 +37,7 @@ use std::str::FromStr;
 use nightsplat_core::curves::{CURVE_AUTO, CURVE_NONE, CURVE_PROFILE, CURVE_TABLE, name_of};
 pub use nightsplat_core::curves::{
     Constant, Constants, Curve, Dual, FAMILIES, Family, Real, SceneLaw, ToneCurve, ToneParameters,
-    Variable, bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve,
+    bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve,
 };
 use nightsplat_core::{Error, Result};
 
@@ -48,7 +48,7 @@ pub use self::file::CurveChoice;
 pub use self::histogram::EMPTY_CHANNEL;
 pub use self::histogram::LuminanceHistogram;
 pub use self::inverse::{InverseTone, scene_law};
-pub use self::mapping::MeasuredPhotograph;
+pub use self::mapping::{ALPHA, BASE_GAIN, CurveNumbers, GAIN_C, MeasuredPhotograph, THETA};
 pub use self::metering::MAX_GAIN;
 pub use self::metering::{CurveEnds, NEAR_WHITE, soft};
 pub use self::profile::{PROFILE_WIDTH, Profile, SEGMENTS, profiled};

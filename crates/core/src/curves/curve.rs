@@ -3,21 +3,6 @@
 
 use super::*;
 
-/// A setting that a curve is a function of.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Variable {
-    /// A constant of the formula.
-    Constant(usize),
-    /// The mean of the target.
-    Theta,
-    /// The largest black level.
-    Alpha,
-    /// The gain per mean luminance.
-    GainC,
-    /// The gain at luminance 0.
-    BaseGain,
-}
-
 /// The curve of one photograph in any number type; [`ToneParameters`] are its numbers on the device.
 #[derive(Clone, Copy, Debug)]
 pub struct Curve<T> {

@@ -3,9 +3,7 @@
 use std::borrow::Cow;
 
 use nightsplat_core::camera::Camera;
-use nightsplat_core::curves::{
-    Constants, Curve, Real, ToneCurve, Variable, clamped, curve_at, padded,
-};
+use nightsplat_core::curves::{Curve, MAX_CONSTANTS, Real, ToneCurve, clamped, curve_at, padded};
 use nightsplat_core::image::{linear_from_srgb, srgb_from_linear};
 
 use super::exposure::Exposure;
@@ -24,6 +22,18 @@ const GAINS: [f64; 2] = [1.0, 6.0];
 
 /// Minimum and maximum of a solved gain.
 const STRENGTHS: [f64; 2] = [1e-3, 1e4];
+
+/// The settings of which a curve is a function, in any number type: the constants of its formula, then theta, alpha, c
+/// and g0.
+pub type CurveNumbers<T> = [T; MAX_CONSTANTS + 4];
+/// The position of theta among the numbers of a curve.
+pub const THETA: usize = MAX_CONSTANTS;
+/// That of alpha.
+pub const ALPHA: usize = THETA + 1;
+/// That of c.
+pub const GAIN_C: usize = ALPHA + 1;
+/// That of g0.
+pub const BASE_GAIN: usize = GAIN_C + 1;
 
 /// Measurements of a photograph.
 #[derive(Clone, Debug, Default)]
@@ -91,23 +101,37 @@ impl MeasuredPhotograph {
 }
 
 impl ToneSettings {
-    /// The curve of a photograph with these statistics; `number` is the value of a setting in the number type.
+    /// The settings of which the curve is a function.
+    #[doc(hidden)]
+    pub fn numbers(&self) -> CurveNumbers<f64> {
+        let [c0, c1, c2, c3, c4, c5, c6, c7] = padded(&self.constants);
+        let Self { theta, alpha, gain_c, base_gain, .. } = *self;
+        [c0, c1, c2, c3, c4, c5, c6, c7, theta, alpha, gain_c, base_gain]
+    }
+
+    /// The same curve with other numbers.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn with_numbers(&self, numbers: &CurveNumbers<f64>) -> Self {
+        let [constants @ .., theta, alpha, gain_c, base_gain] = *numbers;
+        let constants = constants[..self.constants.len()].to_vec();
+        Self { theta, alpha, gain_c, base_gain, constants, ..self.clone() }
+    }
+
+    /// The curve of a photograph with these statistics and these numbers in place of its own.
     #[doc(hidden)]
     pub fn curve_of<T: Real>(
         &self,
         statistics: &Statistics,
-        number: impl Fn(Variable, f64) -> T,
+        numbers: &CurveNumbers<T>,
     ) -> Curve<T> {
+        let [mut constants @ .., theta, alpha, gain_c, base_gain] = *numbers;
         let [zero, one, epsilon] = [0.0, 1.0, EPSILON].map(T::from_f64);
         let measured = |x: f32| T::from_f64(x.into());
         let mean_luminance = measured(statistics.mean_luminance);
-        let theta = number(Variable::Theta, self.theta);
         let bounded_gain = |value: T| {
             (theta / value).at_least(T::from_f64(GAINS[0])).at_most(T::from_f64(GAINS[1]))
         };
-        let given = padded(&self.constants);
-        let mut constants: Constants<T> =
-            std::array::from_fn(|index| number(Variable::Constant(index), given[index]));
         let [white, offset, gain] = match &self.curve {
             Tone::Formula(ToneCurve::Linear) => {
                 let white = measured(statistics.mean) / theta;
@@ -127,13 +151,11 @@ impl ToneSettings {
             }
             curve if curve.is_of_t() => {
                 let is_rescaled = curve.family().is_some_and(|family| family.is_rescaled);
-                let least =
-                    if is_rescaled { number(Variable::BaseGain, self.base_gain) } else { one };
-                let alpha = number(Variable::Alpha, self.alpha);
+                let least = if is_rescaled { base_gain } else { one };
                 [
                     measured(statistics.p90),
                     black_level(alpha, self.beta, statistics.ratio()),
-                    least + number(Variable::GainC, self.gain_c) * mean_luminance,
+                    least + gain_c * mean_luminance,
                 ]
             }
             _ => [one, zero, one],
@@ -156,7 +178,7 @@ impl ToneSettings {
     #[doc(hidden)]
     pub fn parameters(&self, statistics: &Statistics) -> ToneParameters {
         let Curve { white, offset, gain, mut constants, .. } =
-            self.curve_of(statistics, |_, value| value);
+            self.curve_of(statistics, &self.numbers());
         let [white, mut offset, gain] = [white, offset, gain].map(|number| number as f32);
         if self.curve == Tone::Auto {
             (offset, constants[0]) = (self.alpha as f32, self.colour);
