@@ -245,7 +245,6 @@ pub mod config {
     pub use nightsplat_core::camera::TrainingFrame;
     pub use nightsplat_photographs::dataset::{MeasuredSize, PixelOrientation};
     pub use nightsplat_photographs::image::StoredLight;
-    pub use nightsplat_photographs::tone::GainChoice;
 }
 
 /// A small synthetic dark dataset.

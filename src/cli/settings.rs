@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use clap::builder::ValueParser;
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches, ValueHint};
 use nightsplat_core::settings::{Rule, Setting};
-use nightsplat_photographs::tone::{CurveChoice, GainChoice, Profile, Tone, ToneSettings};
+use nightsplat_photographs::tone::{CurveChoice, Profile, Tone, ToneSettings};
 use toml::{Table, Value};
 
 use super::words::{self, NamedValues};
@@ -147,8 +147,16 @@ pub(super) struct CurveOptions {
     pub(super) profile: Option<PathBuf>,
     /// Gain constant c of the curve, or auto to measure the gain, as the curve auto does [default: {tone.gain_c of
     /// ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
-    #[arg(long, value_name = "C|auto")]
-    pub(super) gain: Option<GainChoice>,
+    #[arg(long, value_name = "C|auto", value_parser = gain)]
+    pub(super) gain: Option<Gain>,
+}
+
+/// The gain per mean luminance of a photograph; `None`: the gain is measured.
+type Gain = Option<f64>;
+
+fn gain(text: &str) -> Result<Gain, String> {
+    let wrong = |_| format!("`{text}` is not a gain; use a number, or auto");
+    if text == "auto" { Ok(None) } else { text.parse().map(Some).map_err(wrong) }
 }
 
 impl CurveOptions {
@@ -183,8 +191,8 @@ impl CurveOptions {
         }
         let mut say = |key: &str, value: Value| layer.push(key, value, Origin::Option("--gain"));
         match self.gain {
-            Some(GainChoice::Auto) => say("tone.auto_gain", true.into()),
-            Some(GainChoice::C(gain)) => {
+            Some(None) => say("tone.auto_gain", true.into()),
+            Some(Some(gain)) => {
                 say("tone.auto_gain", false.into())?;
                 say("tone.gain_c", gain.into())
             }

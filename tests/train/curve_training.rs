@@ -3,7 +3,7 @@
 
 use nightsplat_photographs::dataset::LoadOptions;
 use nightsplat_photographs::scene_tone::SceneTone;
-use nightsplat_photographs::tone::{GainChoice, MeasuredPhotograph, Table, Tone};
+use nightsplat_photographs::tone::{MeasuredPhotograph, Table, Tone};
 
 use crate::common::prelude::*;
 
@@ -37,7 +37,7 @@ fn every_kind_of_curve_trains_and_a_recorded_configuration_repeats_it() {
         ToneSettings { scene_statistics: true, ..ToneSettings::new(ToneCurve::Ase) },
         ToneSettings::default(),
         ToneSettings { colour: 0.0, brightness: Some(0.4), ..ToneSettings::default() },
-        ToneSettings::new(ToneCurve::Ap3).with_gain(GainChoice::Auto),
+        ToneSettings::new(ToneCurve::Ap3).with_gain(None),
         ToneSettings { full_resolution: true, ..ToneSettings::new(ToneCurve::Ap3) },
         ToneSettings::new(Tone::Table(dense_table(ToneCurve::Rational))),
         ToneSettings::new(Tone::Profile(crate::common::setup::profile())),

@@ -52,8 +52,7 @@ pub use self::mapping::{ALPHA, BASE_GAIN, CurveNumbers, GAIN_C, MeasuredPhotogra
 pub use self::metering::MAX_GAIN;
 pub use self::metering::{CurveEnds, NEAR_WHITE, soft};
 pub use self::profile::{PROFILE_WIDTH, Profile, SEGMENTS, profiled};
-pub use self::settings::OF_CURVE;
-pub use self::settings::{GainChoice, ToneSettings};
+pub use self::settings::{OF_CURVE, ToneSettings};
 pub use self::statistics::{Statistics, percentiles};
 pub use self::statistics::{luminance, measurable};
 pub use self::table::Table;

@@ -4,7 +4,6 @@ use std::any::Any;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 use nightsplat_core::settings::{self, Rule, Setting};
 use nightsplat_core::{Error, Result};
@@ -158,16 +157,16 @@ impl ToneSettings {
         Self { theta, beta, base_gain, scene_statistics, brightness, ..Self::new(curve) }
     }
 
-    /// The same curve with another gain. An automatic gain implies full resolution.
+    /// The same curve with another c; `None`: with an automatic gain, which implies full resolution.
     #[must_use]
     #[doc(hidden)]
-    pub fn with_gain(self, gain: GainChoice) -> Self {
-        match gain {
-            GainChoice::Auto => Self { auto_gain: true, full_resolution: true, ..self },
-            GainChoice::C(gain_c) if self.auto_gain => {
+    pub fn with_gain(self, gain_c: Option<f64>) -> Self {
+        match gain_c {
+            None => Self { auto_gain: true, full_resolution: true, ..self },
+            Some(gain_c) if self.auto_gain => {
                 Self { gain_c, auto_gain: false, full_resolution: false, ..self }
             }
-            GainChoice::C(gain_c) => Self { gain_c, ..self },
+            Some(gain_c) => Self { gain_c, ..self },
         }
     }
 
@@ -317,29 +316,6 @@ impl ToneSettings {
             )),
             None => Ok(()),
         }
-    }
-}
-
-/// The value of `--gain`.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum GainChoice {
-    /// A gain chosen from the photographs.
-    Auto,
-    /// c: the gain per mean luminance of the photograph.
-    C(f64),
-}
-
-impl FromStr for GainChoice {
-    type Err = Error;
-
-    fn from_str(text: &str) -> Result<Self> {
-        if text == "auto" {
-            return Ok(Self::Auto);
-        }
-        let number = text.parse();
-        number
-            .map(Self::C)
-            .map_err(|_| Error::Usage(format!("`{text}` is not a gain; use a number, or auto")))
     }
 }
 

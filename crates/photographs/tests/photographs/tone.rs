@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use nightsplat_core::Error;
 use nightsplat_photographs::image::{Image, ImageFile as _};
 use nightsplat_photographs::tone::{
-    CurveChoice, GainChoice, Statistics, Tone, ToneCurve, ToneParameters, ToneSettings, percentiles,
+    CurveChoice, Statistics, Tone, ToneCurve, ToneParameters, ToneSettings, percentiles,
 };
 use serde_json::Value;
 
@@ -354,9 +354,9 @@ fn a_curve_without_training_has_its_known_psnr_on_the_test_views() {
 #[test]
 fn a_fixed_gain_replaces_an_automatic_one_and_keeps_full_resolution() {
     let ap3 = ToneSettings::new(ToneCurve::Ap3);
-    let auto = ap3.clone().with_gain(GainChoice::Auto);
+    let auto = ap3.clone().with_gain(None);
     assert!(auto.auto_gain && auto.full_resolution);
-    let fixed = |settings: ToneSettings| settings.with_gain(GainChoice::C(2.0));
+    let fixed = |settings: ToneSettings| settings.with_gain(Some(2.0));
     assert_eq!(fixed(auto), ToneSettings { gain_c: 2.0, ..ap3.clone() });
     let tone_mapped = ToneSettings { full_resolution: true, ..ap3 };
     assert_eq!(fixed(tone_mapped.clone()), ToneSettings { gain_c: 2.0, ..tone_mapped });
