@@ -181,23 +181,18 @@ impl CurveOptions {
             }
             (Some(file), _) => {
                 let settings = file.settings()?;
-                let gain = |gain| settings.clone().with_gain(gain);
-                Some((self.gain.map_or_else(|| settings.clone(), gain), "--curve"))
+                let with_gain = self.gain.map(|gain| settings.clone().with_gain(gain));
+                Some((with_gain.unwrap_or(settings), "--curve"))
             }
             (None, None) => None,
         };
         if let Some((settings, option)) = from_file {
             return push_curve(layer, settings, option);
         }
+        let Some(gain) = self.gain else { return Ok(()) };
         let mut say = |key: &str, value: Value| layer.push(key, value, Origin::Option("--gain"));
-        match self.gain {
-            Some(None) => say("tone.auto_gain", true.into()),
-            Some(Some(gain)) => {
-                say("tone.auto_gain", false.into())?;
-                say("tone.gain_c", gain.into())
-            }
-            None => Ok(()),
-        }
+        say("tone.auto_gain", gain.is_none().into())?;
+        gain.map_or(Ok(()), |gain| say("tone.gain_c", gain.into()))
     }
 }
 

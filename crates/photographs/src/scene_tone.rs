@@ -95,7 +95,7 @@ impl SceneTone {
         }
         let scene = Self::from_photographs(settings, &training);
         let mut scene = scene.ok_or_else(|| all_black(&dataset.root))?;
-        views.iter().zip(&training).for_each(|(view, measured)| scene.add(view, measured));
+        views.iter().zip(&training).for_each(|(view, measured)| scene.add(&view.name, measured));
         scene.model_gain = scene.model_exposure().map(|_| {
             let sum: f64 = scene.gains.values().map(|gain| gain.ln()).sum();
             (sum / scene.gains.len().max(1) as f64).exp()
@@ -108,16 +108,16 @@ impl SceneTone {
         let mut scene = Self::measure(&ToneSettings { law: None, ..settings.clone() }, dataset)?;
         for view in dataset.views.iter().filter(|view| !view.is_train()) {
             if let Some(measured) = measured_of(view, settings.full_resolution)? {
-                scene.add(view, &measured);
+                scene.add(&view.name, &measured);
             }
         }
         Ok(scene)
     }
 
     /// Keeps the curve of a measured photograph, and its gain.
-    fn add(&mut self, view: &View, photograph: &MeasuredPhotograph) {
-        self.curves.insert(view.name.clone(), self.curve_of(photograph));
-        self.gains.extend(self.gain_of(photograph).map(|gain| (view.name.clone(), gain)));
+    fn add(&mut self, name: &str, photograph: &MeasuredPhotograph) {
+        self.curves.insert(name.to_owned(), self.curve_of(photograph));
+        self.gains.extend(self.gain_of(photograph).map(|gain| (name.to_owned(), gain)));
     }
 
     /// The curve and its constants.

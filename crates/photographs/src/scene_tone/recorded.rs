@@ -62,8 +62,7 @@ impl SceneTone {
         if let Some(exposure) = &mut exposure {
             exposure.request(tone.brightness);
         }
-        let new = Self::new(&tone);
-        let mut law = Self { exposure, model_gain, is_recorded: true, ..new };
+        let mut law = Self { exposure, model_gain, is_recorded: true, ..Self::new(&tone) };
         for (name, text) in photographs {
             let out_of_range = || wrong(format!("a number of {name} is out of range"));
             let (gain, curve) = parsed(&text).ok_or_else(out_of_range)?;
@@ -114,13 +113,10 @@ mod tests {
     fn law_of(tone: &ToneSettings) -> SceneTone {
         let measured = [0.05, 0.11, 0.3].map(photograph);
         let scene = SceneTone::from_photographs(tone, &measured).unwrap();
-        let mut law = scene.clone();
-        law.model_gain = scene.exposure.as_ref().map(|set_exposure| set_exposure.gain);
-        for (at, one) in measured.iter().enumerate() {
-            let name = format!("view {at}\"");
-            law.gains.extend(scene.gain_of(one).map(|gain| (name.clone(), gain)));
-            law.curves.insert(name, scene.curve_of(one));
-        }
+        let model_gain = scene.exposure.as_ref().map(|set_exposure| set_exposure.gain);
+        let mut law = SceneTone { model_gain, ..scene };
+        let named = measured.iter().enumerate();
+        named.for_each(|(at, one)| law.add(&format!("view {at}\""), one));
         law
     }
 
