@@ -13,7 +13,7 @@ use std::str::FromStr;
 use bytemuck::{Pod, Zeroable};
 
 pub use self::catalogue::*;
-pub use self::curve::{Curve, bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve};
+pub use self::curve::{bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve};
 pub use self::families::{Constant, Family, padded};
 pub use self::real::{Dual, LARGEST_T, Real, within};
 pub use self::scene_law::SceneLaw;
@@ -42,7 +42,7 @@ pub struct ToneParameters {
     pub gain: f32,
     /// The weight of the curve, relative to the unchanged photograph, 0 to 1.
     pub weight: f32,
-    /// Constants of the family, zeros at the end.
+    /// Constants of the family, zeros at the end; the first three are the white of each channel, if channels differ.
     // A literal: with the constant, rustc 1.95 stops with an internal error at a closure that copies a part of it.
     pub constants: [f32; 8],
 }

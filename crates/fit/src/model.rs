@@ -4,8 +4,8 @@ use std::borrow::Cow;
 
 use nightsplat_core::{Error, Result};
 use nightsplat_photographs::tone::{
-    ALPHA, BASE_GAIN, Constant, Curve, CurveNumbers, Dual, Expression, GAIN_C, Real, Statistics,
-    THETA, Tone, ToneCurve, ToneSettings, clamped,
+    ALPHA, BASE_GAIN, Constant, Constants, CurveNumbers, Dual, GAIN_C, Real, Statistics, THETA,
+    Tone, ToneCurve, ToneSettings, clamped, curve_at,
 };
 
 use super::{FitOptions, Pair};
@@ -155,9 +155,10 @@ pub(super) fn own_settings(curve: &Tone) -> ToneSettings {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct CurveOfT<'a, T> {
     p90: f64,
-    curve: Curve<T>,
-    /// What is evaluated in place of a row of the table of curves.
-    expression: Option<&'a Expression>,
+    curve: &'a Tone,
+    /// White, black level and gain.
+    scale: [T; 3],
+    constants: Constants<T>,
 }
 
 impl<'a, T: Real> CurveOfT<'a, T> {
@@ -166,15 +167,9 @@ impl<'a, T: Real> CurveOfT<'a, T> {
         exposure: &ChannelExposure,
         numbers: &CurveNumbers<T>,
     ) -> Self {
-        let mut curve = settings.curve_of(&exposure.statistics, numbers);
-        if settings.curve == ToneCurve::PerChannel {
-            curve.white = curve.constants[exposure.channel];
-        }
-        let expression = match &settings.curve {
-            Tone::Expression(expression) => Some(expression),
-            _ => None,
-        };
-        Self { p90: exposure.p90(), curve, expression }
+        let [constants @ .., _, _, _, _] = *numbers;
+        let scale = settings.scale(&exposure.statistics, exposure.channel, numbers);
+        Self { p90: exposure.p90(), curve: &settings.curve, scale, constants }
     }
 
     /// At t, clamped.
@@ -184,10 +179,11 @@ impl<'a, T: Real> CurveOfT<'a, T> {
 
     /// At t, unclamped.
     pub(super) fn raw_at(&self, t: f64) -> T {
-        let x = T::from_f64(t * self.p90);
-        match self.expression {
-            Some(expression) => expression.at(x / self.curve.white, &self.curve.constants),
-            None => self.curve.at(x),
+        let [white, offset, gain] = self.scale;
+        let t = T::from_f64(t * self.p90) / white;
+        match self.curve {
+            Tone::Expression(expression) => expression.at(t, &self.constants),
+            curve => curve_at(curve.constant(), t, [offset, gain], &self.constants),
         }
     }
 }

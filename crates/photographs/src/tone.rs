@@ -36,7 +36,7 @@ use std::str::FromStr;
 
 use nightsplat_core::curves::{CURVE_AUTO, CURVE_NONE, CURVE_PROFILE, CURVE_TABLE, name_of};
 pub use nightsplat_core::curves::{
-    Constant, Constants, Curve, Dual, FAMILIES, Family, Real, SceneLaw, ToneCurve, ToneParameters,
+    Constant, Constants, Dual, FAMILIES, Family, Real, SceneLaw, ToneCurve, ToneParameters,
     bounded, clamped, curve_at, mirrored, shoulder, toe, tone_curve,
 };
 use nightsplat_core::{Error, Result};

@@ -1,29 +1,7 @@
-//! The curve of one photograph: its numbers, and its value at x. It is generic over the number type: f64 for the
-//! kernels' parameters, dual numbers for the derivatives of a fit, f32 for the kernels' references.
+//! The value of a curve at x. It is generic over the number type: f64 for the kernels' parameters, dual numbers for the
+//! derivatives of a fit, f32 for the kernels' references.
 
 use super::*;
-
-/// The curve of one photograph in any number type; [`ToneParameters`] are its numbers on the device.
-#[derive(Clone, Copy, Debug)]
-pub struct Curve<T> {
-    /// A `CURVE_*` number.
-    pub number: u32,
-    /// The value that t = 1 corresponds to.
-    pub white: T,
-    /// The black level.
-    pub offset: T,
-    /// The gain.
-    pub gain: T,
-    /// The first three are the white of each channel, if channels differ.
-    pub constants: Constants<T>,
-}
-
-impl<T: Real> Curve<T> {
-    /// Its value at the sRGB-encoded value `x`, unclamped.
-    pub fn at(&self, x: T) -> T {
-        curve_at(self.number, x / self.white, [self.offset, self.gain], &self.constants)
-    }
-}
 
 /// The pseudo-GT value of the sRGB-encoded value `x` under the curve `curve` (a `CURVE_*`), as the kernels of
 /// `include/tone.glsl` compute it: in [0, 1] from 0 on, and [`mirrored`] below.

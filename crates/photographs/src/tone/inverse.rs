@@ -10,8 +10,8 @@
 use std::borrow::Cow;
 
 use nightsplat_core::curves::{
-    CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_TABLE, Curve, clamped, mirrored,
-    shoulder, toe,
+    CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_TABLE, Constants, clamped, curve_at,
+    mirrored, shoulder, toe,
 };
 use nightsplat_core::{Error, Result};
 
@@ -31,9 +31,14 @@ const TRIALS: usize = 60;
 /// The inverse of the curve of a photograph.
 #[derive(Clone, Debug)]
 pub struct InverseTone {
-    curve: Curve<f64>,
-    table: Option<Table>,
+    /// A `CURVE_*` number.
+    curve: u32,
+    white: f64,
+    offset: f64,
+    gain: f64,
     weight: f64,
+    constants: Constants<f64>,
+    table: Option<Table>,
     /// The largest value of a target of each channel that is inverted.
     largest: [f64; 3],
 }
@@ -61,13 +66,13 @@ impl InverseTone {
     }
 
     /// The inverse of any curve but a camera profile, by its `CURVE_*` number.
-    pub fn of_curve(number: u32, table: Option<Table>, parameters: &ToneParameters) -> Self {
+    pub fn of_curve(curve: u32, table: Option<Table>, parameters: &ToneParameters) -> Self {
         let ToneParameters { white, offset, gain, weight, constants } = *parameters;
         let [white, offset, gain, weight] = [white, offset, gain, weight].map(f64::from);
-        let curve = Curve { number, white, offset, gain, constants: constants.map(f64::from) };
-        let mut inverse = Self { curve, table, weight, largest: [1.0; 3] };
+        let (constants, largest) = (constants.map(f64::from), [1.0; 3]);
+        let mut inverse = Self { curve, white, offset, gain, weight, constants, table, largest };
         // The automatic curve gets as high in every channel, through its own curve or that of the luminance.
-        let most = if number == CURVE_AUTO { BRIGHTEST } else { LARGEST };
+        let most = if curve == CURVE_AUTO { BRIGHTEST } else { LARGEST };
         let factor = inverse.factor([most; 3]);
         let highest = |channel| inverse.channel(most, channel, factor).min(1.0);
         inverse.largest = [0, 1, 2].map(|channel| highest(channel) - FLAT);
@@ -80,27 +85,27 @@ impl InverseTone {
     }
 
     fn channel_above_black(&self, x: f64, channel: usize, factor: f64) -> f64 {
-        let Curve { number, white, offset, gain, constants } = &self.curve;
+        let &Self { curve, white, offset, gain, ref constants, .. } = self;
         let t = x / white;
-        let curved = match *number {
+        let curved = match curve {
             CURVE_AUTO => {
                 let [share, bend, end, weight, ..] = *constants;
                 let soft = (1.0 - share) * shoulder(t, bend) + share * t * factor;
-                toe(offset + (1.0 - offset) * soft, *offset, [end, weight])
+                toe(offset + (1.0 - offset) * soft, offset, [end, weight])
             }
             CURVE_TABLE => self.table.as_ref().map_or(t, |table| table.value(t, channel)),
             // A pixel's gain is that of its luminance, up to 1e-6 of it.
             CURVE_LUM_PRESERVE => gain * x,
             CURVE_PER_CHANNEL => x / constants[channel],
-            _ => clamped(self.curve.at(x)),
+            _ => clamped(curve_at(curve, t, [offset, gain], constants)),
         };
         if self.weight < 1.0 { x.min(1.0) + self.weight * (curved - x.min(1.0)) } else { curved }
     }
 
     /// The factor s(Y) / Y of the automatic curve.
     fn factor(&self, rgb: [f64; 3]) -> f64 {
-        let y = (luminance(rgb).abs() / self.curve.white).max(1e-20);
-        shoulder(y, self.curve.constants[1]) / y
+        let y = (luminance(rgb).abs() / self.white).max(1e-20);
+        shoulder(y, self.constants[1]) / y
     }
 
     /// The target of no light.
@@ -121,7 +126,7 @@ impl InverseTone {
         if !is_lit {
             return 0.0;
         }
-        let (mut low, mut high) = (0.0, self.curve.white.min(1.0));
+        let (mut low, mut high) = (0.0, self.white.min(1.0));
         while high < LARGEST && self.channel(high, channel, factor) < value {
             (low, high) = (high, 2.0 * high);
         }
@@ -165,7 +170,7 @@ impl InverseTone {
             |factor: f64| [0, 1, 2].map(|channel| self.solved(bounded[channel], channel, factor));
         // The factor is 1 for black, where the result is the darkest.
         let darkest = solved(1.0);
-        if self.curve.number != CURVE_AUTO || self.curve.constants[0] == 0.0 {
+        if self.curve != CURVE_AUTO || self.constants[0] == 0.0 {
             return darkest;
         }
         // Secants of Y - luminance(rgb(Y)), which is negative below the solution.

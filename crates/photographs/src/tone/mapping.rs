@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use nightsplat_core::camera::Camera;
-use nightsplat_core::curves::{Curve, MAX_CONSTANTS, Real, ToneCurve, clamped, curve_at, padded};
+use nightsplat_core::curves::{MAX_CONSTANTS, Real, ToneCurve, clamped, curve_at, padded};
 use nightsplat_core::image::{linear_from_srgb, srgb_from_linear};
 
 use super::exposure::Exposure;
@@ -118,21 +118,23 @@ impl ToneSettings {
         Self { theta, alpha, gain_c, base_gain, constants, ..self.clone() }
     }
 
-    /// The curve of a photograph with these statistics and these numbers in place of its own.
+    /// White, black level and gain of a channel of a photograph with these statistics, with these numbers in place of
+    /// the curve's own.
     #[doc(hidden)]
-    pub fn curve_of<T: Real>(
+    pub fn scale<T: Real>(
         &self,
         statistics: &Statistics,
+        channel: usize,
         numbers: &CurveNumbers<T>,
-    ) -> Curve<T> {
-        let [mut constants @ .., theta, alpha, gain_c, base_gain] = *numbers;
+    ) -> [T; 3] {
+        let [.., theta, alpha, gain_c, base_gain] = *numbers;
         let [zero, one, epsilon] = [0.0, 1.0, EPSILON].map(T::from_f64);
         let measured = |x: f32| T::from_f64(x.into());
         let mean_luminance = measured(statistics.mean_luminance);
         let bounded_gain = |value: T| {
             (theta / value).at_least(T::from_f64(GAINS[0])).at_most(T::from_f64(GAINS[1]))
         };
-        let [white, offset, gain] = match &self.curve {
+        match &self.curve {
             Tone::Formula(ToneCurve::Linear) => {
                 let white = measured(statistics.mean) / theta;
                 [white.at_least(T::from_f64(MIN_WHITE)), zero, one]
@@ -141,10 +143,7 @@ impl ToneSettings {
                 [one, zero, bounded_gain(mean_luminance + epsilon)]
             }
             Tone::Formula(ToneCurve::PerChannel) => {
-                for (white, mean) in constants.iter_mut().zip(statistics.channel_means) {
-                    *white = (measured(mean) + epsilon) / theta;
-                }
-                [one, zero, one]
+                [(measured(statistics.channel_means[channel]) + epsilon) / theta, zero, one]
             }
             Tone::Formula(ToneCurve::P80) => {
                 [one / bounded_gain(measured(statistics.p80)), zero, one]
@@ -159,8 +158,7 @@ impl ToneSettings {
                 ]
             }
             _ => [one, zero, one],
-        };
-        Curve { number: self.curve.constant(), white, offset, gain, constants }
+        }
     }
 
     /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90. For the automatic curve it is
@@ -177,13 +175,16 @@ impl ToneSettings {
     /// The curve of a photograph with these statistics, before an automatic gain.
     #[doc(hidden)]
     pub fn parameters(&self, statistics: &Statistics) -> ToneParameters {
-        let Curve { white, offset, gain, mut constants, .. } =
-            self.curve_of(statistics, &self.numbers());
-        let [white, mut offset, gain] = [white, offset, gain].map(|number| number as f32);
+        let scale = |channel| self.scale(statistics, channel, &self.numbers()).map(|x| x as f32);
+        let [mut white, mut offset, gain] = scale(0);
+        let mut constants = padded(&self.constants).map(|constant| constant as f32);
         if self.curve == Tone::Auto {
-            (offset, constants[0]) = (self.alpha as f32, self.colour);
+            (offset, constants[0]) = (self.alpha as f32, self.colour as f32);
         }
-        let constants = constants.map(|constant| constant as f32);
+        if self.curve == ToneCurve::PerChannel {
+            constants[..3].copy_from_slice(&[0, 1, 2].map(|channel| scale(channel)[0]));
+            white = 1.0;
+        }
         ToneParameters { white, offset, gain, weight: 1.0, constants }
     }
 
