@@ -12,7 +12,13 @@ if [ "${1:-}" != --allow-dirty ] && [ -n "$(git status --porcelain)" ]; then
     exit 1
 fi
 scratch=$(mktemp -d)
-trap 'rm -rf "$scratch"' EXIT
+# `cargo package` unpacks the crates into its home, in a folder named after that of the packages.
+tidy() {
+    local unpacked=${CARGO_HOME:-$HOME/.cargo}/registry/src
+    find "$unpacked" -mindepth 1 -maxdepth 1 -name "-*" -newer "$scratch" -exec rm -rf {} +
+    rm -rf "$scratch"
+}
+trap tidy EXIT
 
 # Fails unless a build ends with an error of one line that matches.
 refuses() {
@@ -42,8 +48,9 @@ if cargo tree --offline --locked --no-default-features --edges normal,build --pr
     exit 1
 fi
 
-# Debug information takes a third of the build.
-export CARGO_PROFILE_DEV_DEBUG=0
+# cargo neither unpacks nor compiles a version of a crate twice in one folder, and a crate may have changed since. Debug
+# information takes a third of the build.
+export CARGO_TARGET_DIR=$scratch/packaged CARGO_PROFILE_DEV_DEBUG=0
 TIMEFORMAT="packed, and built without C++ in %U s of processor time and %S s of the system's"
 time cargo package --quiet --workspace --locked --offline --allow-dirty --no-default-features
 mkdir -p dist
