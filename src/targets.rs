@@ -31,8 +31,7 @@ pub struct Targets {
 impl Targets {
     /// The targets of a dataset's views, whose training photographs are measured unless a law is recorded.
     pub fn new(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
-        let recorded = SceneTone::recorded(tone)?;
-        Self::in_scene(gpu, recorded.map_or_else(|| SceneTone::measure(tone, dataset), Ok)?)
+        Self::in_scene(gpu, SceneTone::for_dataset(tone, dataset)?)
     }
 
     /// The targets of a scene's views.

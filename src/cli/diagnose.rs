@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 use nightsplat_core::output::{one_line, write_whole};
 use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tree::check_writable;
 use serde::Serialize;
 
@@ -15,7 +16,7 @@ use super::{finish, opener, print, word, words};
 use crate::Error;
 use crate::driver;
 use crate::gpu::DeviceChoice;
-use crate::results::eval::{ResidualTransmittance, hole_warning};
+use crate::results::eval::{ResidualTransmittance, hole_warning, shows_sky};
 use crate::results::finished_run::FinishedRun;
 use crate::results::{diagnosis, verdict};
 use crate::train::plan::Plan;
@@ -156,7 +157,9 @@ fn holes(
             100.0 * mean
         )
     };
-    let remark = hole_warning(views, config.background).unwrap_or_else(healthy);
+    let warning = hole_warning(views, config.background);
+    let scene = || SceneTone::for_dataset(&config.tone, &dataset);
+    let remark = warning.filter(|_| !shows_sky(&config, scene)).unwrap_or_else(healthy);
     Ok((remark, found))
 }
 

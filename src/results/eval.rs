@@ -37,7 +37,9 @@ use nightsplat_models::linear_light::{photograph_of, slope_at, stops_between};
 pub(crate) use scores::{AGAINST, WITH_REFERENCE, add_reference, with_reference};
 pub use scores::{After, Evaluation, Metric, Score};
 pub(crate) use transmittance::warn_of_holes;
-pub use transmittance::{MAX_RESIDUAL_TRANSMITTANCE, ResidualTransmittance, hole_warning};
+pub use transmittance::{
+    MAX_RESIDUAL_TRANSMITTANCE, ResidualTransmittance, hole_warning, shows_sky,
+};
 
 /// The images that test views are scored against.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -385,6 +387,7 @@ impl Evaluation {
         ];
         let mut evaluation = Self {
             scores: vec![],
+            shows_sky: false,
             lpips: extras.lpips.map(|(lpips, _)| lpips.measure()),
             requested: requested.into_iter().flatten().collect(),
         };

@@ -122,6 +122,8 @@ impl RunEvaluation {
             evaluation.add_lit(&dataset, |view| model_renderer.render(view))?;
         }
         if pictures.is_none() {
+            let scene = || SceneTone::for_dataset(&config.tone, &dataset);
+            evaluation.shows_sky = eval::shows_sky(&config, scene);
             let render = |view: &View| model_renderer.render(view);
             eval::warn_of_holes(&evaluation, &dataset, config.background, render)?;
         }

@@ -77,7 +77,8 @@ pub(crate) fn of_model(evaluation: &Evaluation) -> Option<String> {
     let against = evaluation.against();
     let aligned = mean(Metric::Psnr, After::GainAndBias);
     let let_through = mean(Metric::ResidualTransmittance, After::Model);
-    let has_holes = let_through.is_some_and(|share| share > MAX_RESIDUAL_TRANSMITTANCE);
+    let is_open = let_through.is_some_and(|share| share > MAX_RESIDUAL_TRANSMITTANCE);
+    let has_holes = is_open && !evaluation.shows_sky;
     let [good, fair] = grades(against);
     // A gain is a matter of taste, unless it hides everything else.
     let is_at_least = |[least, least_ssim]: [f64; 2]| {
@@ -105,7 +106,8 @@ pub(crate) fn of_model(evaluation: &Evaluation) -> Option<String> {
     }
     sentence += &format!(", SSIM {ssim:.3}");
     if let Some(share) = let_through {
-        sentence += &format!(", {:.1} % of the background shows through", 100.0 * share);
+        let sky = if evaluation.shows_sky { ", as sky" } else { "" };
+        sentence += &format!(", {:.1} % of the background shows through{sky}", 100.0 * share);
     }
     let below = far_below(evaluation);
     if let Some((name, psnr)) = below.first() {
@@ -170,6 +172,10 @@ mod tests {
         );
         assert!(of(ReferenceKind::PseudoGt, &[22.0], 0.8, 0.0).starts_with("Fair"));
         assert!(of(ReferenceKind::PseudoGt, &[32.0], 0.9, 0.3).starts_with("Fair"), "holes");
+        let mut open = evaluation(ReferenceKind::PseudoGt, &[32.0], 0.9, 0.3);
+        open.shows_sky = true;
+        let sky = of_model(&open).unwrap();
+        assert!(sky.starts_with("Good") && sky.ends_with("shows through, as sky"), "{sky}");
         assert!(of(ReferenceKind::Photographs, &[12.0], 0.9, 0.0).starts_with("Poor"));
         let far = of(ReferenceKind::References, &[25.0, 26.0, 25.5, 25.5, 26.0, 14.0], 0.8, 0.0);
         assert!(far.ends_with("; v5 is far below, at 14.00 dB"), "{far}");

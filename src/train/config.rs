@@ -164,7 +164,8 @@ pub struct TrainConfig {
     ssim_weight: f64 = 0.2 => Rule::SHARE, "--ssim-weight W";
     /// Maximum number of Gaussians.
     max_gaussians: usize = 1_000_000 => Rule::at_least(1), in "Gaussians", "--max-gaussians N";
-    /// Background during training: black, or random, a new colour every step. Scores and renders use black.
+    /// Background during training: black, or random, a new colour every step; the plan chooses black below a black sky,
+    /// which then needs no Gaussians. Scores and renders use black.
     background: Background = Background::Random => Rule::OneOf(&["black", "random"]), "--background BACKGROUND";
     /// Also score the test views every N steps, to evals.csv; 0: at the end only.
     eval_every: u64 = 0 => Rule::COUNT, in "steps", "--eval-every N";

@@ -7,7 +7,7 @@ use nightsplat_diagnose::{DiagnosedViews, Diagnosis, SceneDiagnosis};
 use nightsplat_models::gaussians::{Features, Shape, width};
 use nightsplat_photographs::dataset::{Dataset, RowBands};
 use nightsplat_photographs::findings::too_near_white;
-use nightsplat_photographs::tone::{Tone, ToneCurve};
+use nightsplat_photographs::tone::{BLACK_SKY, Tone, ToneCurve};
 use serde::{Deserialize, Serialize};
 use toml::Value;
 
@@ -39,7 +39,7 @@ const MEMORY_SHARE: f64 = 0.5;
 const COPIES: f64 = 4.0 * 1.5;
 
 /// The decision on a part of the model, with its reason.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlannedPart {
     /// Whether the model has it.
@@ -125,6 +125,9 @@ pub struct Plan {
     pub bands: PlannedBands,
     /// Whether a tone curve makes the targets; otherwise they are the photographs.
     pub curve: PlannedPart,
+    /// Whether the model leaves a black sky open, over a black background.
+    #[serde(default)]
+    pub sky: PlannedPart,
     /// Whether each view's exposure is learned.
     pub exposure: PlannedPart,
     /// [`Part::Lamp`](crate::train::Part::Lamp).
@@ -158,6 +161,7 @@ impl Plan {
             dataset: diagnosis.fingerprint.clone(),
             falloff: falloff(scene),
             bands: bands(scene),
+            sky: sky(scene, curve.on),
             curve,
             exposure: spread.exposure(),
             lamp: lamp(scene, config),
@@ -185,6 +189,9 @@ impl Plan {
         }
         if !self.curve.on {
             set("tone.curve", ToneCurve::None.name().into())?;
+        }
+        if self.sky.on {
+            set("background", "black".into())?;
         }
         set("exposure.learn", self.exposure.on.into())?;
         set("model.lamp", self.lamp.on.into())?;
@@ -215,6 +222,7 @@ impl Plan {
             ("falloff", switch(self.falloff.on), &self.falloff.why),
             ("bands", switch(self.bands.on), &self.bands.why),
             part("curve", &self.curve),
+            part("sky", &self.sky),
             part("exposure", &self.exposure),
             ("lamp", switch(self.lamp.on), &self.lamp.why),
             part("denoiser", &self.denoiser),
@@ -306,6 +314,20 @@ fn curve(scene: &SceneDiagnosis, config: &TrainConfig) -> PlannedPart {
         on,
         why: [Some(why), near_white].into_iter().flatten().collect::<Vec<_>>().join("; "),
     }
+}
+
+/// Without Gaussians, a sky is as black as its background. A random one would have to be covered, by Gaussians that no
+/// point starts.
+fn sky(scene: &SceneDiagnosis, has_curve: bool) -> PlannedPart {
+    let SceneDiagnosis { black_sky, .. } = *scene;
+    let on = has_curve && black_sky >= BLACK_SKY;
+    let why = format!(
+        "{:.0} % of a photograph is black{} (threshold {:.0} %, dark sets only)",
+        100.0 * black_sky,
+        if on { ": sky that stays open, over a black background" } else { "" },
+        100.0 * BLACK_SKY
+    );
+    PlannedPart { on, why }
 }
 
 /// The spread of the targets' exposures.

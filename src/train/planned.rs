@@ -4,6 +4,7 @@ use std::path::Path;
 
 use nightsplat_photographs::dataset::{Dataset, LoadOptions};
 use nightsplat_photographs::external_targets::ExternalTargets;
+use nightsplat_photographs::tone::Tone;
 use toml::Value;
 
 use super::config::TrainConfig;
@@ -66,11 +67,16 @@ impl RequestedSettings {
         if let Some(plan) = plan {
             // Any requested tone setting decides the curve.
             let names_a_curve = requested.iter().any(|layer| layer.names("tone."));
+            let automatic = Value::from(Tone::Auto.name());
+            let is_automatic = get("tone.curve").is_none_or(|curve| *curve == automatic)
+                && get("tone.brightness").is_none();
             // Exposures and the tonemapper exclude each other, and a plan never enables both.
             let has_tonemapper = get("model.tonemapper") == Some(&Value::Boolean(true));
             let mut layer = plan.layer()?;
             layer.0.retain(|(key, ..)| match key.as_str() {
                 "tone.curve" => !names_a_curve,
+                // Other targets have a grey sky.
+                "background" => is_automatic,
                 "exposure.learn" => !has_tonemapper,
                 _ => true,
             });

@@ -42,7 +42,7 @@ pub fn reference() -> Result<String> {
             text,
             "| `{}` | {} | {} | {} |",
             row.key,
-            default.map_or_else(|| row.absent.unwrap_or_default().to_owned(), cell),
+            cell(row, default),
             escaped(&row.takes()),
             escaped(&told(row)),
         );
@@ -73,15 +73,17 @@ fn presets(text: &mut String) -> Result<()> {
         let values = all.iter().map(|values| values.get(row.key.as_ref()));
         let values: Vec<Option<&Value>> = values.collect();
         if values.iter().any(|value| *value != values[0]) {
-            let cells = values.iter().map(|value| value.map(cell).unwrap_or_default());
+            let cells = values.iter().map(|value| cell(row, *value));
             let _ = writeln!(text, "| `{}` | {} |", row.key, cells.collect::<Vec<_>>().join(" | "));
         }
     }
     Ok(())
 }
 
-fn cell(value: &Value) -> String {
-    format!("`{value}`")
+/// The value of a setting, or what its absence means.
+fn cell(row: &Setting, value: Option<&Value>) -> String {
+    let absent = || row.absent.unwrap_or_default().to_owned();
+    value.map_or_else(absent, |value| format!("`{value}`"))
 }
 
 /// Text escaped for a table cell.

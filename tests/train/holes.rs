@@ -6,6 +6,7 @@ use nightsplat::results::eval::{
 use nightsplat::train::{Background, Part};
 use nightsplat_photographs::dataset::View;
 use nightsplat_photographs::image::Mask;
+use nightsplat_synth::Night;
 
 use crate::common::command::{json, unwrapped};
 use crate::common::paths;
@@ -175,4 +176,30 @@ fn holes_are_reported_by_train_eval_and_diagnose() {
     assert_eq!(views.len(), set().views);
     assert_eq!(of(&views["000"]), of(&residual_transmittance["views"]["000"]));
     assert!(!folder.succeed("diagnose @ --json").contains("residual_transmittance"));
+}
+
+#[test]
+fn a_black_sky_is_left_open_and_is_no_hole() {
+    let night = Night { sky: true, ..Night::NONE };
+    let folder = written(&SyntheticOptions { night, ..set() });
+    for (more, background) in [
+        ("--background random", "random"),
+        ("--curve ase", "random"),
+        ("--brightness 0.4", "random"),
+        ("--curve auto", "black"),
+        ("", "black"),
+    ] {
+        let train = "train @ --out @run --steps 60 --progress none --overwrite";
+        let (_, warned) = folder.run(&format!("{train} {more}"), 0);
+        says(&folder.text("run/config.toml"), &[&format!("background = \"{background}\"")]);
+        // After a few steps, colours still show through.
+        assert_eq!(warned.contains("of the background"), background == "random", "{warned}");
+    }
+    let open = &folder.json("run/metrics.json")["residual_transmittance"]["mean"]["mean"];
+    assert!(open.as_f64().unwrap() > 3.0 * MAX_RESIDUAL_TRANSMITTANCE, "{open}");
+    let (_, warned) = folder.run("eval @run", 0);
+    assert!(!warned.contains("of the background"), "{warned}");
+    let message = unwrapped(&folder.succeed("diagnose @ --run @run"));
+    says(&message, &["% of a photograph is black: sky that stays open", "shows through the model"]);
+    assert!(!message.contains("note: view "), "{message}");
 }

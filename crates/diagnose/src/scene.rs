@@ -28,6 +28,8 @@ pub struct SceneDiagnosis {
     pub brightening: f64,
     /// The share of pixels that `--curve auto` brings near white, 0.94 or more.
     pub brought_near_white: f64,
+    /// The mean share of a photograph that is black sky.
+    pub black_sky: f64,
     /// The gain of `--curve auto`, for encoded values.
     pub gain: f64,
     /// The standard deviation of the views' exposures, in stops; of their gains, if the points do not determine
@@ -96,6 +98,7 @@ impl SceneDiagnosis {
             darkening: darkening(light),
             brightening: exposure.brightening(),
             brought_near_white: 0.0,
+            black_sky: exposure.sky,
             gain: exposure.gain,
             exposure_spread: measured.unwrap_or(exposure.spread / std::f64::consts::LN_2),
             spread_is_measured: measured.is_some(),

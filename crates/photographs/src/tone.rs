@@ -49,7 +49,7 @@ pub use self::histogram::EMPTY_CHANNEL;
 pub use self::histogram::LuminanceHistogram;
 pub use self::inverse::{InverseTone, scene_law};
 pub use self::mapping::{ALPHA, BASE_GAIN, CurveNumbers, GAIN_C, MeasuredPhotograph, THETA};
-pub use self::metering::MAX_GAIN;
+pub use self::metering::{BLACK_SKY, MAX_GAIN};
 pub use self::metering::{CurveEnds, NEAR_WHITE, soft};
 pub use self::profile::{PROFILE_WIDTH, Profile, SEGMENTS, profiled};
 pub use self::settings::{OF_CURVE, ToneSettings};

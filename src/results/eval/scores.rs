@@ -125,6 +125,8 @@ pub struct Score {
 pub struct Evaluation {
     /// A row for each view, metric and step, the views in the order of the dataset.
     pub scores: Vec<Score>,
+    /// Whether the background that shows is black sky, and no hole.
+    pub(crate) shows_sky: bool,
     /// The version of LPIPS.
     pub(crate) lpips: Option<LpipsVersion>,
     /// The steps whose part of `metrics.json` is written even if no view has it.

@@ -4,11 +4,13 @@
 //! surface. The residual transmittance of the blend does: the product of 1 - alpha over all splats of a pixel.
 
 use nightsplat_photographs::dataset::{Dataset, View};
+use nightsplat_photographs::scene_tone::SceneTone;
+use nightsplat_photographs::tone::Tone;
 use serde::Serialize;
 
 use super::{Evaluation, Metric};
 use crate::Result;
-use crate::train::{Background, Rendered};
+use crate::train::{Background, Rendered, TrainConfig};
 
 /// A view with a higher mean has a hole. No view of a model of a real scene exceeds 0.095 after 400 to 3 500 steps over
 /// black (docs/measurements.md).
@@ -70,8 +72,15 @@ pub fn hole_warning<'a>(
     ))
 }
 
-/// Warns of holes in the scored views of a model that was trained over `background`; without scored views, in some of
-/// the training views, which `render` renders.
+/// Whether the background of a run shows as the black sky of its photographs, which is no hole.
+pub fn shows_sky(config: &TrainConfig, scene: impl FnOnce() -> Result<SceneTone>) -> bool {
+    let has_sky = |scene: SceneTone| scene.exposure.is_some_and(|it| it.has_black_sky());
+    let is_open = config.background == Background::Black && config.tone.curve == Tone::Auto;
+    is_open && scene().is_ok_and(has_sky)
+}
+
+/// Warns of holes in the scored views of a run's model; without scored views, in some of the training views, which
+/// `render` renders.
 pub(crate) fn warn_of_holes(
     evaluation: &Evaluation,
     dataset: &Dataset,
@@ -80,6 +89,9 @@ pub(crate) fn warn_of_holes(
 ) -> Result<()> {
     /// The maximum number of training views to render, evenly spread.
     const MOST: usize = 8;
+    if evaluation.shows_sky {
+        return Ok(());
+    }
     let scores = evaluation.scores.iter();
     let means = scores.filter(|score| score.metric == Metric::ResidualTransmittance);
     let mut means: Vec<(&str, f64)> =

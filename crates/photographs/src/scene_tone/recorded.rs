@@ -10,6 +10,7 @@ use nightsplat_core::{Error, Result, output};
 use serde::{Deserialize, Serialize};
 
 use super::SceneTone;
+use crate::dataset::Dataset;
 use crate::tone::{Exposure, ToneParameters, ToneSettings};
 use crate::tree;
 
@@ -48,6 +49,11 @@ impl SceneTone {
             law.settings.curve.name()
         );
         Err(Error::input(path, problem))
+    }
+
+    /// The scene whose law these settings name, or else that of a dataset's training photographs.
+    pub fn for_dataset(settings: &ToneSettings, dataset: &Dataset) -> Result<Self> {
+        Self::recorded(settings)?.map_or_else(|| Self::measure(settings, dataset), Ok)
     }
 
     /// Reads a law.

@@ -19,7 +19,7 @@ use nightsplat_core::camera::{Camera, CameraPoses};
 use serde::{Deserialize, Serialize};
 
 use super::histogram::LuminanceHistogram;
-use super::metering::{CurveEnds, MAX_GAIN, Metering, gain_at, mean_of_soft};
+use super::metering::{BLACK_SKY, CurveEnds, MAX_GAIN, Metering, gain_at, mean_of_soft};
 
 /// The minimum weight of a view's own gain if cameras are unknown.
 const MIN_SHARE: f64 = 0.75;
@@ -68,6 +68,8 @@ pub struct Exposure {
     pub black: usize,
     /// The number of photographs among dark ones that are well lit, and their own targets.
     pub lit: usize,
+    /// The mean share of a photograph that is black sky, without shadows.
+    pub sky: f64,
     /// How the curve reaches white and leaves black.
     pub ends: CurveEnds,
     metering: Metering,
@@ -133,6 +135,7 @@ impl Exposure {
             share: share_without_cameras(variance),
             black: black.len(),
             lit: lit.len(),
+            sky: metering.sky,
             ends,
             metering,
             lit_below,
@@ -208,6 +211,11 @@ impl Exposure {
         self.around.as_ref().map_or(self.gain, |around| around.ln_gain(camera).exp())
     }
 
+    /// Whether so much is black sky that the model leaves it open.
+    pub fn has_black_sky(&self) -> bool {
+        self.sky >= BLACK_SKY
+    }
+
     /// The mean brightness of the targets over that of the photographs.
     pub fn brightening(&self) -> f64 {
         self.target / self.mean
@@ -280,13 +288,15 @@ struct SerializedExposure {
     #[serde(default)]
     lit: usize,
     #[serde(default)]
+    sky: f64,
+    #[serde(default)]
     ends: CurveEnds,
     reason: String,
 }
 
 impl From<SerializedExposure> for Exposure {
     fn from(written: SerializedExposure) -> Self {
-        let SerializedExposure { gain, target, mean, spread, share, black, lit, ends, .. } =
+        let SerializedExposure { gain, target, mean, spread, share, black, lit, sky, ends, .. } =
             written;
         let metering = Metering::default();
         Self {
@@ -297,6 +307,7 @@ impl From<SerializedExposure> for Exposure {
             share,
             black,
             lit,
+            sky,
             ends,
             metering,
             lit_below: None,
@@ -309,8 +320,21 @@ impl From<Exposure> for SerializedExposure {
     fn from(exposure: Exposure) -> Self {
         let (brightening, weight, reason) =
             (exposure.brightening(), exposure.weight(), exposure.reason());
-        let Exposure { gain, target, mean, spread, share, black, lit, ends, .. } = exposure;
-        Self { gain, target, mean, brightening, weight, spread, share, black, lit, ends, reason }
+        let Exposure { gain, target, mean, spread, share, black, lit, sky, ends, .. } = exposure;
+        Self {
+            gain,
+            target,
+            mean,
+            brightening,
+            weight,
+            spread,
+            share,
+            black,
+            lit,
+            sky,
+            ends,
+            reason,
+        }
     }
 }
 

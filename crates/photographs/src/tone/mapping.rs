@@ -47,7 +47,7 @@ pub struct MeasuredPhotograph {
 }
 
 /// The largest share of values below black, where encoding cuts noise, that leaves the measurements right.
-const BELOW_BLACK: f64 = 0.1;
+const BELOW_BLACK: f64 = 0.05;
 
 /// The most pixels of a row over which light is averaged.
 const LONGEST_RUN: usize = 32;

@@ -5,7 +5,7 @@
 //! S(t)       = 1 - exp(-u), u = ln(1 + s t) / s; u = t for s = 0
 //! gain(H)    k = 0.90 / (mean W^3)^(1/3), W = min(Y, 99.9 % quantile of Y, 2.5 times the 90 % quantile)
 //!            within the gains at which the mean of soft(Y; k) is 0.42 and 0.54, s = 0
-//!            times exp(-0.3 (saturation - 0.25)), at most 128
+//!            times exp(-0.6 (saturation - 0.30)) with a saturation of 0.175 to 0.65, at most 128
 //! ```
 //!
 //! H is the histogram of the encoded luminance Y. A cubic mean is between average metering (power 1) and metering for
@@ -44,10 +44,11 @@ pub(super) const GAINS: [f64; 2] = [1e-3, MAX_GAIN];
 /// The largest gain.
 pub const MAX_GAIN: f64 = 128.0;
 
-/// ln k falls by this per saturation, from that of typical scenes on, up to the largest that noise does not feign.
-const PER_SATURATION: f64 = 0.3;
-const TYPICAL_SATURATION: f64 = 0.25;
-const LARGEST_SATURATION: f64 = 0.75;
+/// ln k falls by this per saturation, from that of typical scenes on, within the saturations that pairs have. Noise
+/// feigns higher ones.
+const PER_SATURATION: f64 = 0.6;
+const TYPICAL_SATURATION: f64 = 0.30;
+const SATURATIONS: [f64; 2] = [0.175, 0.65];
 
 /// k Y below which a pixel of the whole counts as black.
 const BLACK: f64 = 0.2;
@@ -56,6 +57,9 @@ const BLACK: f64 = 0.2;
 /// are between [`BLACK`] and twice that are shadows and do not count. Rooms have 0 to 0.2, a night sky its share of the
 /// frame.
 const BLACK_SHARES: [f64; 2] = [0.25, 0.35];
+
+/// From this share on, the model leaves the sky open. The target of black is then at most half of the black level.
+pub const BLACK_SKY: f64 = 0.3;
 
 /// The toe ends at this multiple of the luminance below which pixels count as black.
 const TOE: f64 = 2.0;
@@ -104,8 +108,8 @@ pub(super) struct Metering {
     /// The luminance below which pixels of the whole scene count as black, and the luminance of its highlights.
     black: f64,
     highlights: f64,
-    /// The share of black pixels that is left out.
-    left_out: f64,
+    /// The mean share of a photograph that is black and no shadow.
+    pub(super) sky: f64,
 }
 
 /// The quantile of highlights, which follow the exposure of a photograph, whatever share of it is black.
@@ -128,9 +132,13 @@ impl Metering {
             let black = whole.black_of(view);
             2.0 * view.fraction_below(black) - view.fraction_below(2.0 * black)
         });
-        let share = shares.sum::<f64>() / views.len().max(1) as f64;
+        Self { sky: (shares.sum::<f64>() / views.len().max(1) as f64).max(0.0), ..whole }
+    }
+
+    /// The share of black pixels that takes no part in the metering.
+    fn left_out(&self) -> f64 {
         let [none, all] = BLACK_SHARES;
-        Self { left_out: ((share - none) / (all - none)).clamp(0.0, 1.0), ..whole }
+        ((self.sky - none) / (all - none)).clamp(0.0, 1.0)
     }
 
     /// The luminance below which pixels of a photograph count as black: less than that of the scene if it is exposed
@@ -145,15 +153,16 @@ impl Metering {
         if let Some(mean) = self.brightness {
             return gain_at(luminance, mean);
         }
-        let gain = if self.left_out > 0.0 {
-            let counted = luminance.without_below(self.black_of(luminance), self.left_out);
+        let left_out = self.left_out();
+        let gain = if left_out > 0.0 {
+            let counted = luminance.without_below(self.black_of(luminance), left_out);
             // The ground below a night sky is at most middle grey.
-            rule(&counted, [MEANS[0], MEANS[1] - self.left_out * (MEANS[1] - MIDDLE_GREY)])
+            rule(&counted, [MEANS[0], MEANS[1] - left_out * (MEANS[1] - MIDDLE_GREY)])
         } else {
             rule(luminance, MEANS)
         };
-        let saturation = luminance.saturation().min(LARGEST_SATURATION) - TYPICAL_SATURATION;
-        let ln_factor = self.ln_factor - PER_SATURATION * saturation;
+        let saturation = luminance.saturation().clamp(SATURATIONS[0], SATURATIONS[1]);
+        let ln_factor = self.ln_factor - PER_SATURATION * (saturation - TYPICAL_SATURATION);
         (gain * ln_factor.exp()).clamp(GAINS[0], GAINS[1])
     }
 
@@ -163,7 +172,7 @@ impl Metering {
         if self.brightness.is_some() {
             return CurveEnds::default();
         }
-        let toe_weight = self.left_out;
+        let toe_weight = self.left_out();
         let toe = if toe_weight > 0.0 { soft(TOE * self.black, gain) } else { 0.0 };
         CurveEnds { shoulder: shoulder_below(scene, gain), toe, toe_weight }
     }
