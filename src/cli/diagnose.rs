@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 use nightsplat_core::output::{one_line, write_whole};
 use nightsplat_photographs::dataset::Dataset;
-use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tree::check_writable;
 use serde::Serialize;
 
@@ -16,7 +15,7 @@ use super::{finish, opener, print, word, words};
 use crate::Error;
 use crate::driver;
 use crate::gpu::DeviceChoice;
-use crate::results::eval::{ResidualTransmittance, hole_warning, shows_sky};
+use crate::results::eval::{ResidualTransmittance, hole_warning, photographs_show_sky};
 use crate::results::finished_run::FinishedRun;
 use crate::results::{diagnosis, verdict};
 use crate::train::plan::Plan;
@@ -158,8 +157,8 @@ fn holes(
         )
     };
     let warning = hole_warning(views, config.background);
-    let scene = || SceneTone::for_dataset(&config.tone, &dataset);
-    let remark = warning.filter(|_| !shows_sky(&config, scene)).unwrap_or_else(healthy);
+    let warning = warning.filter(|_| !photographs_show_sky(&config, &dataset));
+    let remark = warning.unwrap_or_else(healthy);
     Ok((remark, found))
 }
 

@@ -38,7 +38,8 @@ pub(crate) use scores::{AGAINST, WITH_REFERENCE, add_reference, with_reference};
 pub use scores::{After, Evaluation, Metric, Score};
 pub(crate) use transmittance::warn_of_holes;
 pub use transmittance::{
-    MAX_RESIDUAL_TRANSMITTANCE, ResidualTransmittance, hole_warning, shows_sky,
+    MAX_RESIDUAL_TRANSMITTANCE, ResidualTransmittance, hole_warning, photographs_show_sky,
+    shows_sky,
 };
 
 /// The images that test views are scored against.

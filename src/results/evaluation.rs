@@ -122,8 +122,7 @@ impl RunEvaluation {
             evaluation.add_lit(&dataset, |view| model_renderer.render(view))?;
         }
         if pictures.is_none() {
-            let scene = || SceneTone::for_dataset(&config.tone, &dataset);
-            evaluation.shows_sky = eval::shows_sky(&config, scene);
+            evaluation.shows_sky = eval::photographs_show_sky(&config, &dataset);
             let render = |view: &View| model_renderer.render(view);
             eval::warn_of_holes(&evaluation, &dataset, config.background, render)?;
         }

@@ -135,6 +135,11 @@ impl SceneTone {
         self.exposure.as_ref().filter(|_| !matches!(self.settings.curve, Tone::Profile(_)))
     }
 
+    /// See [`Exposure::has_black_sky`]; not, if the curve does not follow the exposure.
+    pub fn has_black_sky(&self) -> bool {
+        self.exposure.as_ref().is_some_and(Exposure::has_black_sky)
+    }
+
     /// The gains of a dataset's training views, by name: see [`SceneTone::gain_of`].
     pub fn gains<'a>(&self, dataset: &'a Dataset) -> BTreeMap<&'a str, f64> {
         let gain = |(_, view): (usize, &'a View)| Some((&*view.name, *self.gains.get(&view.name)?));

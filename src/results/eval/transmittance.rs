@@ -72,11 +72,17 @@ pub fn hole_warning<'a>(
     ))
 }
 
-/// Whether the background of a run shows as the black sky of its photographs, which is no hole.
-pub fn shows_sky(config: &TrainConfig, scene: impl FnOnce() -> Result<SceneTone>) -> bool {
-    let has_sky = |scene: SceneTone| scene.exposure.is_some_and(|it| it.has_black_sky());
-    let is_open = config.background == Background::Black && config.tone.curve == Tone::Auto;
-    is_open && scene().is_ok_and(has_sky)
+/// Whether the background of a run over black shows as the sky of its photographs, which is no hole.
+/// `has_black_sky` is asked only if it can.
+pub fn shows_sky(config: &TrainConfig, has_black_sky: impl FnOnce() -> bool) -> bool {
+    let can = config.background == Background::Black && config.tone.curve == Tone::Auto;
+    can && has_black_sky()
+}
+
+/// [`shows_sky`] for a run whose photographs have yet to be measured.
+pub fn photographs_show_sky(config: &TrainConfig, dataset: &Dataset) -> bool {
+    let scene = || SceneTone::for_dataset(&config.tone, dataset);
+    shows_sky(config, || scene().is_ok_and(|scene| scene.has_black_sky()))
 }
 
 /// Warns of holes in the scored views of a run's model; without scored views, in some of the training views, which

@@ -453,7 +453,7 @@ impl<'a> TrainLoop<'a> {
         let mut evaluation =
             Evaluation::new(&mut score_reference, dataset, &extras, render, write_first)?;
         self.score_reference = Some(score_reference);
-        evaluation.shows_sky = eval::shows_sky(self.config, || Ok(trainer.scene().clone()));
+        evaluation.shows_sky = eval::shows_sky(self.config, || trainer.scene().has_black_sky());
         if self.config.model.lamp {
             evaluation.add_lit(dataset, |view| trainer.render(&view.camera))?;
         }
