@@ -400,11 +400,11 @@ fn a_well_lit_folder_is_unchanged_and_a_black_one_refused() {
 fn the_automatic_curve_has_its_known_scores() {
     let Some(lom) = shared("data/lom") else { return };
     let mut mean = 0.0;
-    for (scene, known) in [("chair", 25.87), ("sofa", 30.04), ("shrub", 19.59)] {
+    for (scene, known) in [("chair", 25.86), ("sofa", 30.42), ("shrub", 19.74)] {
         let output = apply(&automatic(&lom.join(scene), "")).unwrap();
         let psnr = output.scene.scores.unwrap().psnr;
         assert!((psnr - known).abs() < 0.05, "{scene}: {psnr}");
         mean += psnr / 3.0;
     }
-    assert!(mean >= 25.1, "{mean}");
+    assert!(mean >= 25.3, "{mean}");
 }
