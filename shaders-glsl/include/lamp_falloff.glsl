@@ -77,13 +77,6 @@ float lamp_tone_slope(Lamp loaded, float x) {
     return loaded.reach == 0.0 || x < 0.0 ? 1.0 : exp(-min(x / loaded.reach, LAMP_KNEE));
 }
 
-// A colour in the light with this factor.
-vec3 lamp_lit(Lamp loaded, float factor, vec3 color) {
-    for (uint c = 0; c < 3; c++)
-        color[c] = loaded.black + lamp_tone(loaded, factor * lamp_tone_inverse(loaded, color[c] - loaded.black));
-    return color;
-}
-
 // d ln light / d ln beam
 float lamp_share(Lamp loaded, LampPoint at) { return (1.0 - loaded.ambient) * at.beam / at.light; }
 
@@ -98,6 +91,38 @@ vec3 lamp_point_gradient(Lamp loaded, LampPoint at) {
     if (at.radius >= LAMP_NEAREST * loaded.reference_distance)
         gradient -= (loaded.exponent + turn * dot(at.towards, at.axis)) * at.towards;
     return loaded.slope * lamp_share(loaded, at) / at.distance * gradient;
+}
+
+// A colour in the light at a point.
+vec3 lamp_lit(vec3 point, vec3 color) {
+    Lamp loaded = load_lamp();
+    float factor = lamp_factor(loaded, lamp_at(loaded, point));
+    for (uint c = 0; c < 3; c++)
+        color[c] = loaded.black + lamp_tone(loaded, factor * lamp_tone_inverse(loaded, color[c] - loaded.black));
+    return color;
+}
+
+// From the gradient of a lit colour to that of the colour without the lamp; the gradient of the point is added.
+void lamp_lit_backward(vec3 point, vec3 lit, inout vec3 d_color, inout vec3 d_point) {
+    Lamp loaded = load_lamp();
+    LampPoint at = lamp_at(loaded, point);
+    float factor = lamp_factor(loaded, at), d_log_factor = 0.0;
+    for (uint c = 0; c < 3; c++) {
+        float x = lamp_tone_inverse(loaded, lit[c] - loaded.black), d_x = d_color[c] * lamp_tone_slope(loaded, x);
+        d_log_factor += d_x * x;
+        d_color[c] = d_x * factor / lamp_tone_slope(loaded, x / factor);
+    }
+    d_point += d_log_factor * lamp_point_gradient(loaded, at);
+}
+
+// The gradient of ln factor, from that of the colour without the lamp.
+float lamp_log_factor_gradient(Lamp loaded, LampPoint at, vec3 lit, vec3 d_color) {
+    float factor = lamp_factor(loaded, at), d = 0.0;
+    for (uint c = 0; c < 3; c++) {
+        float x = lamp_tone_inverse(loaded, lit[c] - loaded.black) / factor;
+        d += d_color[c] * x * lamp_tone_slope(loaded, x);
+    }
+    return d;
 }
 
 // The gradient of ln factor with respect to the learned numbers.

@@ -87,10 +87,12 @@ void main() {
             barrier();
             coopMatStore(sum[b][r], sums, 0, N, gl_CooperativeMatrixLayoutRowMajor);
             barrier();
-            for (uint i = gl_SubgroupInvocationID; i < M * N; i += SUBGROUP_SIZE) {
+            // Unrolled: around a loop that stays one, the index of a matrix is no constant and moves all to memory.
+            [[unroll]] for (uint k = 0; k < M * N; k += SUBGROUP_SIZE) {
+                uint i = k + gl_SubgroupInvocationID;
                 uint channel = first_channel + b * M + i / N;
                 uvec2 at = origin + uvec2(i % N, r);
-                if (channel < out_channels && at.x < size.x && at.y < size.y) {
+                if (i < M * N && channel < out_channels && at.x < size.x && at.y < size.y) {
                     uint pixel = (channel * size.y + at.y) * size.x + at.x;
                     float value = unpacked(sums[i], largest_weight[0], largest_source[0]);
                     if (BIASED) value += values[biases + channel];

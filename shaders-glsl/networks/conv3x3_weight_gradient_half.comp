@@ -16,8 +16,9 @@
 //! single precision.
 //!
 //! d_weight(M out, N in) of tap t += d_target(M out, K pixels) input_t(K pixels, N in) for every K pixels of every row
-//! of a strip, both from `pack_map`. A subgroup owns BLOCKS matrices of output channels by one of input channels, for
-//! all nine taps, and slides a window of three rows down K columns after K columns: a matrix of input is loaded once.
+//! of a strip, both from `pack_map`. A subgroup owns a matrix of output channels by one of input channels, for all nine
+//! taps, and slides a window of three rows down K columns after K columns: a matrix of input is loaded once. Two
+//! matrices of output channels would spill (compiled by Mesa 25 for Navi 31).
 //! `pack_map` states the rounding error. Biases are summed in single precision. Reference:
 //! `src/reference/conv3x3_weight_gradient_half.rs`.
 
@@ -26,8 +27,7 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(constant_id = 0) const uint M = 8;       // output channels of a matrix
 layout(constant_id = 1) const uint N = 8;       // input channels of a matrix
 layout(constant_id = 2) const uint K = 8;       // pixels of a matrix, side by side
-layout(constant_id = 3) const uint BLOCKS = 2;  // matrices of output channels
-layout(constant_id = 4) const uint ROWS = 4;    // of a strip
+layout(constant_id = 3) const uint ROWS = 4;    // of a strip
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;  // pixels
@@ -35,7 +35,7 @@ layout(push_constant, scalar) uniform Params {
     uint  out_channels;
 };
 
-// Workgroups: (in channels / N, out channels / (M BLOCKS), strips).
+// Workgroups: (in channels / N, out channels / M, strips).
 layout(binding = 0) readonly  buffer LargestSource  { uint largest_source[]; };     // as for `pack_map`
 layout(binding = 1) readonly  buffer LargestDTarget { uint largest_d_target[]; };
 layout(binding = 2) readonly  buffer Source         { HALVES source[]; };           // (rows, columns, in)
@@ -55,14 +55,13 @@ void main() {
     uint from = packed_channels(in_channels), to = packed_channels(out_channels);
     uint columns = packed_size(size).x;
     uint first_in = gl_WorkGroupID.x * N;
-    uint first_out = gl_WorkGroupID.y * BLOCKS * M;
+    uint first_out = gl_WorkGroupID.y * M;
     uint top = gl_WorkGroupID.z * ROWS;
     uint end = min(top + ROWS, size.y);
 
-    coopmat<float, gl_ScopeSubgroup, M, N, gl_MatrixUseAccumulator> sum[BLOCKS][TAPS];
-    [[unroll]] for (uint b = 0; b < BLOCKS; ++b)
-        [[unroll]] for (uint t = 0; t < TAPS; ++t)
-            sum[b][t] = coopmat<float, gl_ScopeSubgroup, M, N, gl_MatrixUseAccumulator>(0.0);
+    coopmat<float, gl_ScopeSubgroup, M, N, gl_MatrixUseAccumulator> sum[TAPS];
+    [[unroll]] for (uint t = 0; t < TAPS; ++t)
+        sum[t] = coopmat<float, gl_ScopeSubgroup, M, N, gl_MatrixUseAccumulator>(0.0);
 
     for (uint first = 0; first < size.x; first += K) {
         // Rows of the packed map, whose first is above the image.
@@ -75,15 +74,11 @@ void main() {
             [[unroll]] for (uint c = 0; c < 3; ++c)
                 coopMatLoad(window[2][c], source, ((y + 2) * columns + first + c) * from + first_in, from,
                     gl_CooperativeMatrixLayoutRowMajor);
-            [[unroll]] for (uint b = 0; b < BLOCKS; ++b) {
-                // Blocks beyond the last channels repeat sums, which are discarded.
-                uint channel = min(first_out + b * M, to - M);
-                coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> factor;
-                coopMatLoad(factor, d_target, ((y + 1) * columns + first + 1) * to + channel, to,
-                    gl_CooperativeMatrixLayoutColumnMajor);
-                [[unroll]] for (uint t = 0; t < TAPS; ++t)
-                    sum[b][t] = coopMatMulAdd(factor, window[t / 3][t % 3], sum[b][t]);
-            }
+            coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> factor;
+            coopMatLoad(factor, d_target, ((y + 1) * columns + first + 1) * to + first_out, to,
+                gl_CooperativeMatrixLayoutColumnMajor);
+            [[unroll]] for (uint t = 0; t < TAPS; ++t)
+                sum[t] = coopMatMulAdd(factor, window[t / 3][t % 3], sum[t]);
             [[unroll]] for (uint c = 0; c < 3; ++c) {
                 window[0][c] = window[1][c];
                 window[1][c] = window[2][c];
@@ -93,24 +88,22 @@ void main() {
 
     uint weight_count = TAPS * in_channels * out_channels;
     uint set = gl_WorkGroupID.z * (weight_count + out_channels);
-    [[unroll]] for (uint b = 0; b < BLOCKS; ++b) {
-        [[unroll]] for (uint t = 0; t < TAPS; ++t) {
-            barrier();
-            coopMatStore(sum[b][t], sums, 0, N, gl_CooperativeMatrixLayoutRowMajor);
-            barrier();
-            // Unrolled: around a loop that stays one, the index of a matrix is no constant and moves all to memory.
-            [[unroll]] for (uint k = 0; k < M * N; k += SUBGROUP_SIZE) {
-                uint i = k + gl_SubgroupInvocationID;
-                uint channel = first_out + b * M + i / N, other = first_in + i % N;
-                if (i < M * N && channel < out_channels && other < in_channels)
-                    partials[set + (channel * in_channels + other) * TAPS + t] = unpacked(sums[i], largest_d_target[0],
-                        largest_source[0]);
-            }
+    [[unroll]] for (uint t = 0; t < TAPS; ++t) {
+        barrier();
+        coopMatStore(sum[t], sums, 0, N, gl_CooperativeMatrixLayoutRowMajor);
+        barrier();
+        // Unrolled: around a loop that stays one, the index of a matrix is no constant and moves all to memory.
+        [[unroll]] for (uint k = 0; k < M * N; k += SUBGROUP_SIZE) {
+            uint i = k + gl_SubgroupInvocationID;
+            uint channel = first_out + i / N, other = first_in + i % N;
+            if (i < M * N && channel < out_channels && other < in_channels)
+                partials[set + (channel * in_channels + other) * TAPS + t] = unpacked(sums[i], largest_d_target[0],
+                    largest_source[0]);
         }
     }
 
     if (first_in > 0) return;
-    for (uint channel = first_out; channel < min(first_out + BLOCKS * M, out_channels); ++channel) {
+    for (uint channel = first_out; channel < min(first_out + M, out_channels); ++channel) {
         float bias = 0.0;
         uint begin = (channel * size.y + top) * size.x;
         for (uint i = gl_SubgroupInvocationID; i < (end - top) * size.x; i += SUBGROUP_SIZE)

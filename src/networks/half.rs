@@ -12,8 +12,6 @@ use crate::kernels::{
 
 /// The most matrices of output channels per subgroup, times four rows of pixels: sixteen sums in registers.
 const BLOCKS: u32 = 4;
-/// The most matrices of output channels for the weight gradient, times nine taps: eighteen sums.
-const STRIP_BLOCKS: u32 = 2;
 
 /// Values per subgroup of the search for the largest magnitude.
 const CHUNK: u32 = 2048;
@@ -67,7 +65,6 @@ pub(super) struct HalfConv {
     matrix: CooperativeMatrix,
     /// Matrices of output channels per subgroup.
     blocks: u32,
-    strip_blocks: u32,
     largest: Pipeline<largest_magnitude::Kernel>,
     pack_map: Pipeline<pack_map::Kernel>,
     pack_weights: [Pipeline<pack_weights::Kernel>; 2],
@@ -84,19 +81,17 @@ impl HalfConv {
         adds: AccumulateInto,
     ) -> Result<Self> {
         let CooperativeMatrix { m, n, k } = matrix;
-        let [blocks, strip_blocks] =
-            [BLOCKS, STRIP_BLOCKS].map(|most| channels.div_ceil(m).min(most));
+        let blocks = channels.div_ceil(m).min(BLOCKS);
         let pack_weights = |transposed| gpu.pipeline(&pack_weights::Constants { transposed });
         let product = |biased, target| {
             let accumulate = adds == target;
             gpu.pipeline(&conv3x3_half::Constants { m, n, k, blocks, biased, accumulate })
         };
-        let (blocks_of_strip, rows) = (strip_blocks, HALF_STRIP_ROWS);
+        let rows = HALF_STRIP_ROWS;
         Ok(Self {
             channels,
             matrix,
             blocks,
-            strip_blocks,
             largest: gpu.pipeline(&largest_magnitude::Constants { chunk: CHUNK })?,
             pack_map: gpu.pipeline(&pack_map::Constants::default())?,
             pack_weights: [pack_weights(false)?, pack_weights(true)?],
@@ -108,7 +103,6 @@ impl HalfConv {
                 m,
                 n,
                 k,
-                blocks: blocks_of_strip,
                 rows,
             })?,
             reduce: Reduce::new(gpu)?,
@@ -250,11 +244,7 @@ impl HalfConv {
                 d_target_single: d_target_single.slice(),
                 partials: strips.partials.slice_mut(),
             },
-            Threads::Workgroups([
-                in_channels.div_ceil(n),
-                out_channels.div_ceil(self.strip_blocks * m),
-                strip_count,
-            ]),
+            Threads::Workgroups([in_channels.div_ceil(n), out_channels.div_ceil(m), strip_count]),
         )?;
         self.reduce.record(pass, [in_channels, out_channels], strip_count, offset, strips)
     }

@@ -73,17 +73,29 @@ impl Lamp {
         numbers
     }
 
-    /// The light at a point in view space.
-    pub fn light(&self, point: DVec3) -> f64 {
+    /// A point in view space, seen from the lamp.
+    pub(crate) fn at(&self, point: DVec3) -> LampPoint {
         let offset = point - DVec3::from(self.position);
-        let distance =
-            (offset.length() / self.reference_distance).clamp(LAMP_NEAREST, LAMP_FARTHEST);
+        let length = offset.length() / self.reference_distance;
+        let distance = length.clamp(LAMP_NEAREST, LAMP_FARTHEST);
         let towards = offset / (distance * self.reference_distance);
-        let axis = DVec3::new(self.axis[0], self.axis[1], 1.0).normalize();
+        let axis = self.tangents().normalize();
         let away = 1.0 - towards.dot(axis).clamp(-1.0, 1.0);
         let [first, second] = self.falloffs;
         let beam = distance.powf(-self.exponent) * (-(first + second * away) * away).exp();
-        self.ambient + (1.0 - self.ambient) * beam
+        let light = self.ambient + (1.0 - self.ambient) * beam;
+        LampPoint { axis, towards, length, distance, away, beam, light }
+    }
+
+    /// (x, y, 1) along the axis.
+    pub(crate) fn tangents(&self) -> DVec3 {
+        let [x, y] = self.axis;
+        DVec3::new(x, y, 1.0)
+    }
+
+    /// The light at a point in view space.
+    pub fn light(&self, point: DVec3) -> f64 {
+        self.at(point).light
     }
 
     /// light^slope at a point in view space: the factor on the argument of the tone curve.
@@ -196,8 +208,8 @@ impl Lamp {
     }
 
     /// The lamp of the device's numbers.
-    pub(crate) fn of_numbers(numbers: &[f32]) -> Self {
-        let at = |n: u32| f64::from(numbers[n as usize]);
+    pub(crate) fn of_numbers<T: Copy + Into<f64>>(numbers: &[T]) -> Self {
+        let at = |n: u32| -> f64 { numbers[n as usize].into() };
         let reference_distance = at(LAMP_REFERENCE_DISTANCE);
         let share = sigmoid(at(LAMP_AMBIENT));
         let softplus = |x: f64| x.max(0.0) + (-x.abs()).exp().ln_1p();
@@ -214,6 +226,23 @@ impl Lamp {
             reach: at(LAMP_REACH),
         }
     }
+}
+
+/// What the light at a point, and its gradient, have in common.
+pub(crate) struct LampPoint {
+    /// The direction of the lamp.
+    pub(crate) axis: DVec3,
+    /// From the lamp to the point; of length 1 but beyond the bounds of the distance.
+    pub(crate) towards: DVec3,
+    /// The distance in reference distances.
+    pub(crate) length: f64,
+    /// The same within its bounds.
+    pub(crate) distance: f64,
+    /// 1 - cos of the angle between both directions.
+    pub(crate) away: f64,
+    /// The lamp's own light, without the ambient one.
+    pub(crate) beam: f64,
+    pub(crate) light: f64,
 }
 
 fn sigmoid(x: f64) -> f64 {

@@ -48,11 +48,7 @@ void main() {
         if (d_dc == vec3(0.0)) continue;
         vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
         LampPoint at = lamp_at(loaded, cameras[camera_index].view_from_world * vec4(mean, 1.0));
-        float factor = lamp_factor(loaded, at), d = 0.0;
-        for (uint c = 0; c < 3; c++) {
-            float x = lamp_tone_inverse(loaded, colors[COLOR_VECTORS * i][c] - loaded.black) / factor;
-            d += d_dc[c] / SH_C0 * x * lamp_tone_slope(loaded, x);
-        }
+        float d = lamp_log_factor_gradient(loaded, at, colors[COLOR_VECTORS * i].rgb, d_dc / SH_C0);
         float gradient[LAMP_WIDTH];
         lamp_gradient(loaded, at, gradient);
         [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) sums[n] += d * gradient[n];

@@ -171,10 +171,7 @@ void main() {
     vec3 offset = mean - center;
     if (IS_ORTHOGRAPHIC) offset = transpose(mat3(view))[2];
     vec3 rgb = sh_color(i, normalize(offset * finite_scale(length(offset))));
-    if (LAMP) {
-        Lamp loaded = load_lamp();
-        rgb = lamp_lit(loaded, lamp_factor(loaded, lamp_at(loaded, mean_in_view)), rgb);
-    }
+    if (LAMP) rgb = lamp_lit(mean_in_view, rgb);
     rgb = shown(rgb);
     if (INSTANCES) rgb *= instances[instance].tint.rgb;
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;

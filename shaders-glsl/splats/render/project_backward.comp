@@ -200,17 +200,7 @@ void main() {
             d_mean_in_view[k] += record[RECORD_HEAD + CHANNELS - 1] * camera_depth_change(mean_in_view, axis, camera);
         }
     }
-    if (LAMP) {
-        Lamp loaded = load_lamp();
-        LampPoint at = lamp_at(loaded, mean_in_view);
-        float factor = lamp_factor(loaded, at), d_log_factor = 0.0;
-        for (uint c = 0; c < 3; c++) {
-            float x = lamp_tone_inverse(loaded, color[c] - loaded.black), d_x = d_color[c] * lamp_tone_slope(loaded, x);
-            d_log_factor += d_x * x;
-            d_color[c] = d_x * factor / lamp_tone_slope(loaded, x / factor);
-        }
-        d_mean_in_view += d_log_factor * lamp_point_gradient(loaded, at);
-    }
+    if (LAMP) lamp_lit_backward(mean_in_view, color, d_color, d_mean_in_view);
     vec3 d_mean = world_from_view * d_mean_in_view;
     if (COLOR_GRADIENTS) {
         for (uint c = 0; c < written_rest(); c++) gradients[rest_gradient(i, c)] = d_color[c];
