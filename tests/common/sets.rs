@@ -44,7 +44,7 @@ pub(crate) fn relit(set: &Path, change: impl Fn(usize, [u32; 2], f64) -> f64) {
     });
 }
 
-/// A lamp_set, which a lamp that moves with the camera may light.
+/// A room, which a lamp that moves with the camera may light.
 pub(crate) fn lamp_set(lamp: Option<f64>) -> SyntheticOptions {
     SyntheticOptions { views: 20, width: 96, height: 72, seed: 4, lamp, ..Default::default() }
 }
