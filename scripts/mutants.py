@@ -43,7 +43,9 @@ TREE = WORK / "tree"
 MODULES = [
     "src/splats/optimizer", "src/splats/densify", "src/loss", "src/splats/render", "crates/photographs/src/tone"
 ]
-TESTS = "cli gpu loss networks photographs splats train"
+TESTS = "cli core diagnose gpu loss models networks photographs pose splats train"
+# The packages of these programs.
+PACKAGES = ["nightsplat", *(f"nightsplat-{name}" for name in ("core", "diagnose", "models", "photographs", "pose"))]
 # Tests of a mutant run in order of speed until they have taken this many seconds.
 MOST_SECONDS = 120
 # Tests of a program run together if that adds at most this to the time spent so far: fast tests catch most mutants,
@@ -194,9 +196,9 @@ def viable(mutants):
 
 
 def built(tests):
-    """The test programs, by package and name: those of the crate with mutants too."""
+    """The test programs, by package and name: those of the crates too."""
     names = [argument for test in tests for argument in ("--test", test)]
-    packages = ["--package", "nightsplat", "--package", "nightsplat-photographs"]
+    packages = [argument for package in PACKAGES for argument in ("--package", package)]
     run, said = messages("test", "--no-run", "--lib", *packages, *names)
     if run.returncode != 0:
         sys.exit(run.stderr[-4000:])

@@ -1,12 +1,10 @@
 //! The built binary as a shell runs it, and folders for its files.
 
-use std::fs;
-use std::path::Path;
 use std::process::{Command, Output};
 
 use serde_json::Value;
 
-pub(crate) use super::{Folder, says};
+pub(crate) use super::{Folder, file_names, says};
 
 /// `nightsplat` with arguments as a shell splits them; paths must not contain spaces. Any validation message fails it.
 pub(crate) fn command(arguments: &str) -> Command {
@@ -95,14 +93,6 @@ impl Folder {
     pub(crate) fn json(&self, name: &str) -> Value {
         json(self.read(name))
     }
-}
-
-/// The names in a folder, in order.
-pub(crate) fn file_names(folder: impl AsRef<Path>) -> Vec<String> {
-    let names = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name());
-    let mut names: Vec<String> = names.map(|name| name.into_string().unwrap()).collect();
-    names.sort();
-    names
 }
 
 /// A text without the line breaks of its paragraphs.

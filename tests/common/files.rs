@@ -51,6 +51,14 @@ pub(crate) fn paths(folder: &Path) -> Vec<PathBuf> {
     paths
 }
 
+/// The names in a folder, in order.
+pub(crate) fn file_names(folder: impl AsRef<Path>) -> Vec<String> {
+    let names = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name());
+    let mut names: Vec<String> = names.map(|name| name.into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
 /// Every file below a folder, in order.
 pub(crate) fn files_below(folder: &Path) -> Vec<PathBuf> {
     let inner = |path: PathBuf| if path.is_dir() { files_below(&path) } else { vec![path] };

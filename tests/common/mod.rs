@@ -3,7 +3,9 @@
 
 #![allow(dead_code, unused_imports, unused_macros, reason = "no test binary uses everything")]
 
+pub(crate) mod arbitrary;
 pub(crate) mod chain;
+pub(crate) mod clouds;
 pub(crate) mod command;
 mod files;
 pub(crate) mod grid;
@@ -13,15 +15,19 @@ pub(crate) mod png;
 pub(crate) mod prelude;
 pub(crate) mod process;
 pub(crate) mod safetensors;
+pub(crate) mod sets;
 pub(crate) mod setup;
 pub(crate) mod train;
 pub(crate) mod workspace;
 
 pub(crate) use files::{
-    Folder, contents, copy, files_below, fixture, not_run, paths, says, shared,
+    Folder, contents, copy, file_names, files_below, fixture, not_run, paths, says, shared,
 };
-use nightsplat::gpu::Gpu;
+use glam::{DAffine3, DVec2};
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
+use nightsplat::gpu::{CheckReport, Gpu};
+use nightsplat::train::{StepReport, Trainer};
+use nightsplat_core::camera::Camera;
 use nightsplat_core::random::Stream;
 
 /// A device that no other test uses, to count memory and passes.
@@ -112,4 +118,29 @@ pub(crate) fn narrow(values: &[f64]) -> Vec<f32> {
 
 pub(crate) fn widen(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&value| value.into()).collect()
+}
+
+/// A camera with square pixels and its principal point in the middle.
+pub(crate) fn pinhole(size: [u32; 2], focal: f64, view_from_world: DAffine3) -> Camera {
+    let field_of_view = 2.0 * (0.5 * f64::from(size[1]) / focal).atan();
+    Camera {
+        focal: DVec2::splat(focal),
+        ..Camera::perspective(view_from_world, field_of_view, size)
+    }
+}
+
+/// Work whose passes agree with their references, and what ran.
+#[track_caller]
+pub(crate) fn agreeing<R>(work: impl FnOnce() -> R) -> (R, CheckReport) {
+    let (result, report) = gpu().checked(work);
+    report.agree().unwrap();
+    (result, report)
+}
+
+/// A step of training, likewise.
+#[track_caller]
+pub(crate) fn agreeing_step(trainer: &mut Trainer) -> (Vec<StepReport>, CheckReport) {
+    let (reports, report) = trainer.check_step();
+    report.agree().unwrap();
+    (reports.unwrap(), report)
 }

@@ -1,11 +1,12 @@
 //! What most tests use.
 
+pub(crate) use crate::common::sets::{captured, relit, repaint, small_set, written};
 pub(crate) use crate::common::setup::Setup;
-pub(crate) use crate::common::train::{
-    advance, captured, relit, set_small_parts, small_set, written,
-};
+pub(crate) use crate::common::train::{advance, set_small_parts};
 pub(crate) use crate::common::workspace::Workspace;
-pub(crate) use crate::common::{Folder, Random, assert_close, says, shared};
+pub(crate) use crate::common::{
+    Folder, Random, agreeing, agreeing_step, assert_close, pinhole, says, shared,
+};
 pub(crate) use glam::{DAffine3, DMat3, DQuat, DVec2, DVec3, UVec2, Vec2, Vec3};
 pub(crate) use nightsplat::gpu::testing::{gpu, gpu_with};
 pub(crate) use nightsplat::gpu::{Gpu, Threads};

@@ -1,4 +1,4 @@
-//! Small datasets, and training on them.
+//! Training on small datasets.
 
 use std::path::Path;
 
@@ -6,27 +6,10 @@ use nightsplat::gpu::testing::gpu;
 use nightsplat::train::{Part, StepReport, TrainConfig, Trainer};
 use nightsplat_models::gaussians::Gaussians;
 use nightsplat_photographs::dataset::Dataset;
-use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb, srgb_from_linear};
-use nightsplat_synth::{Capture, SyntheticOptions};
+use nightsplat_photographs::image::{Image, ImageFile as _};
 
-use super::{Folder, paths};
-
-/// A synthetic set of this many views of a size.
-pub(crate) fn small_set(views: usize, [width, height]: [u32; 2], seed: u64) -> SyntheticOptions {
-    SyntheticOptions { views, width, height, seed, ..SyntheticOptions::default() }
-}
-
-/// A folder with a synthetic set.
-pub(crate) fn written(options: &SyntheticOptions) -> Folder {
-    captured(options, &Capture::default())
-}
-
-/// [`written`], as captured in this way.
-pub(crate) fn captured(options: &SyntheticOptions, capture: &Capture) -> Folder {
-    let folder = Folder::empty();
-    nightsplat_synth::write_captured(&folder, options, capture).unwrap();
-    folder
-}
+use super::paths;
+use super::sets::{small_set, written};
 
 /// Six views of 40 x 30 pixels, with depth maps of half the size, as estimators return them: a plane that recedes
 /// upwards.
@@ -37,18 +20,6 @@ pub(crate) fn write_with_depth(set: &Path) {
     for photograph in paths(&set.join("low")) {
         let name = photograph.file_stem().unwrap().to_str().unwrap();
         map.save_png16(set.join(format!("depth/depth_{name}.png"))).unwrap();
-    }
-}
-
-/// Changes the linear light of the photographs of a set: a function of photograph, column, row and light.
-pub(crate) fn relit(set: &Path, change: impl Fn(usize, [u32; 2], f64) -> f64) {
-    for (index, path) in paths(&set.join("low")).iter().enumerate() {
-        let image = Image::load(path).unwrap();
-        let pixel = |x, y| {
-            let light = |value: f32| change(index, [x, y], linear_from_srgb(value).into()) as f32;
-            image.pixel(x, y).map(|value| srgb_from_linear(light(value)).clamp(0.0, 1.0))
-        };
-        Image::from_fn(image.width, image.height, pixel).save_png8(path).unwrap();
     }
 }
 

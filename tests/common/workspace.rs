@@ -5,7 +5,7 @@ use std::ops::Deref;
 use std::path::Path;
 
 use super::command::Folder;
-use super::train::small_set;
+use super::sets::small_set;
 
 /// A folder with a dataset of nine small views in `set`, and runs next to it.
 pub(crate) struct Workspace(Folder);

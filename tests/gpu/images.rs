@@ -32,14 +32,7 @@ pub(crate) const OPTIONS: RenderOptions =
 
 /// Two views, one for each layer.
 pub(crate) fn cameras() -> [Camera; 2] {
-    [0.0, 0.3].map(|shift| Camera {
-        width: SIZE[0],
-        height: SIZE[1],
-        focal: DVec2::splat(40.0),
-        principal_point: DVec2::new(24.0, 20.0),
-        model: CameraModel::Pinhole,
-        view_from_world: DAffine3::from_translation(DVec3::new(shift, 0.0, 0.0)),
-    })
+    [0.0, 0.3].map(|shift| pinhole(SIZE, 40.0, DAffine3::from_translation(shift * DVec3::X)))
 }
 
 /// Some three hundred in front of the cameras, 2 to 3 away.

@@ -75,18 +75,18 @@ struct Outcome {
 }
 
 fn evaluate(
-    gpu: &Gpu,
     weights: [f64; 2],
     (size, loss_region): (UVec2, LossRegion),
     [denoised, render]: [&[f32]; 2],
 ) -> Outcome {
+    let gpu = gpu();
     let [mut d_denoised, mut d_render] =
         ["d_denoised", "d_render"].map(|d| gpu.buffer(d, &vec![f32::NAN; render.len()]).unwrap());
     let [denoised, render] =
         [("denoised", denoised), ("render", render)].map(|(n, x)| gpu.buffer(n, x).unwrap());
-    let mut loss = term(gpu, weights).unwrap();
+    let mut loss = term(&gpu, weights).unwrap();
     loss.reserve(size).unwrap();
-    let logged = log_step(gpu, |pass, log| {
+    let logged = log_step(&gpu, |pass, log| {
         let inputs = LossInputs { size, loss_region, render: &denoised, target: &render };
         loss.record(pass, inputs, &mut d_denoised, &mut d_render, log)
     })
@@ -97,7 +97,6 @@ fn evaluate(
 
 #[test]
 fn the_terms_match_their_reference_and_finite_differences() {
-    let gpu = gpu();
     for (size, loss_region) in cases() {
         let values = 3 * size.element_product() as usize;
         let (denoised, render) = (noise(1, values, 0.0, 1.0), noise(2, values, -0.2, 1.2));
@@ -131,7 +130,7 @@ fn the_terms_match_their_reference_and_finite_differences() {
             let numeric = central_differences(&b, |b| loss_of(size, loss_region, &a, b));
             assert_gradient("d_render", &d_render, &numeric);
         }
-        let actual = evaluate(&gpu, WEIGHTS, (size, loss_region), [&denoised, &render]);
+        let actual = evaluate(WEIGHTS, (size, loss_region), [&denoised, &render]);
         let close = |what: &str, actual: &[f32], expected: &[f32]| {
             assert_close(what, actual, expected, 1e-5 * largest(expected));
         };
@@ -146,11 +145,11 @@ fn the_terms_match_their_reference_and_finite_differences() {
 
 #[test]
 fn the_terms_agree_with_pytorch() {
-    let (gpu, torch) = (gpu(), Torch::read());
+    let torch = Torch::read();
     let size = UVec2::new(17, 13);
     let images = [torch.get("denoising.denoised"), torch.get("denoising.rendered")];
     let evaluate = |mse: f64, total_variation: f64| {
-        evaluate(&gpu, [mse, total_variation], (size, LossRegion::whole(size)), images)
+        evaluate([mse, total_variation], (size, LossRegion::whole(size)), images)
     };
     let (mse, tv) = (evaluate(1.0, 0.0), evaluate(0.0, 1.0));
     torch.assert_agrees("denoising.mse.value", &[mse.logged.losses.get(Term::DENOISING)]);
@@ -165,7 +164,7 @@ fn the_terms_agree_with_pytorch() {
 fn a_constant_image_equal_to_the_render_has_no_loss() {
     let size = UVec2::new(20, 21);
     let image = vec![0.3; 3 * 420];
-    let outcome = evaluate(&gpu(), WEIGHTS, (size, LossRegion::whole(size)), [&image, &image]);
+    let outcome = evaluate(WEIGHTS, (size, LossRegion::whole(size)), [&image, &image]);
     assert_eq!(outcome.logged.losses.get(Term::DENOISING), 0.0);
     assert_eq!(outcome.logged.losses.get(Term::TOTAL_VARIATION), 0.0);
     assert!([outcome.d_denoised, outcome.d_render].concat().iter().all(|&d| d == 0.0));
@@ -173,7 +172,6 @@ fn a_constant_image_equal_to_the_render_has_no_loss() {
 
 #[test]
 fn a_value_that_is_not_finite_reaches_the_log_if_it_counts() {
-    let gpu = gpu();
     let size = UVec2::splat(20);
     let loss_region = LossRegion { origin: UVec2::splat(5), size: UVec2::splat(10) };
     let image = noise(3, 1200, 0.0, 1.0);
@@ -183,7 +181,7 @@ fn a_value_that_is_not_finite_reaches_the_log_if_it_counts() {
         image
     };
     let broken = |images: [&[f32]; 2]| {
-        let Logged { losses, status } = evaluate(&gpu, WEIGHTS, (size, loss_region), images).logged;
+        let Logged { losses, status } = evaluate(WEIGHTS, (size, loss_region), images).logged;
         assert_eq!(status, if losses.first_not_finite().is_some() { NOT_FINITE } else { 0 });
         [Term::DENOISING, Term::TOTAL_VARIATION].map(|term| !losses.get(term).is_finite())
     };
@@ -195,13 +193,11 @@ fn a_value_that_is_not_finite_reaches_the_log_if_it_counts() {
 
 #[test]
 fn the_same_step_leaves_the_same_bits() {
-    let gpu = gpu();
     let size = UVec2::new(131, 97);
     let values = 3 * size.element_product() as usize;
     let (denoised, render) = (noise(1, values, 0.0, 1.0), noise(2, values, 0.0, 1.0));
     let step = || {
-        let outcome =
-            evaluate(&gpu, WEIGHTS, (size, LossRegion::whole(size)), [&denoised, &render]);
+        let outcome = evaluate(WEIGHTS, (size, LossRegion::whole(size)), [&denoised, &render]);
         let terms = [Term::DENOISING, Term::TOTAL_VARIATION];
         let values = terms.map(|term| outcome.logged.losses.get(term));
         (bits(&values), bits(&outcome.d_denoised), bits(&outcome.d_render))

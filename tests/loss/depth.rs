@@ -117,10 +117,8 @@ fn chunk_size() -> u32 {
 
 #[test]
 fn the_kernels_match_their_references() {
-    let gpu = gpu();
     for (size, side) in CASES {
-        let (_, report) = gpu.checked(|| evaluate(&gpu, 0.1, side, size, &depths(size), 11));
-        report.agree().unwrap();
+        let (_, report) = agreeing(|| evaluate(0.1, side, size, &depths(size), 11));
         assert_eq!(report.passes.len(), 5, "boxes, moments, correlation, gradient, log");
     }
 }
@@ -204,31 +202,29 @@ fn a_view_smaller_than_a_box_has_smaller_boxes_and_a_tiny_view_none() {
 
 /// The whole term on the last plane of a render; returns that plane of the gradient.
 fn evaluate(
-    gpu: &Gpu,
     weight: f64,
     box_side: u32,
     size: [u32; 2],
     [plane, depth]: &[Vec<f32>; 2],
     step: u64,
 ) -> (Logged, Vec<f32>) {
-    let colors = 3 * plane.len();
+    let (gpu, colors) = (gpu(), 3 * plane.len());
     let render = gpu.buffer("render", &[&vec![9.0; colors], &**plane].concat()).unwrap();
     let mut d_render = gpu.buffer("d_render", &vec![f32::NAN; render.len()]).unwrap();
-    let mut loss = DepthLoss::new(gpu, weight, box_side, Stream::new(10, 5)).unwrap();
+    let mut loss = DepthLoss::new(&gpu, weight, box_side, Stream::new(10, 5)).unwrap();
     loss.reserve(size.into()).unwrap();
     loss.add(Some(depth)).unwrap();
     let inputs = term_inputs(size.into(), FEATURES, &render, step);
     let logged =
-        log_step(gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log)).unwrap();
+        log_step(&gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log)).unwrap();
     (logged, gpu.read(&d_render).unwrap().split_off(colors))
 }
 
 #[test]
 fn the_term_is_the_mean_over_the_view_and_over_its_boxes() {
-    let gpu = gpu();
     for (size, box_side) in CASES {
         let images = depths(size);
-        let (logged, d_render) = evaluate(&gpu, 0.3, box_side, size, &images, 4);
+        let (logged, d_render) = evaluate(0.3, box_side, size, &images, 4);
         let key = (Stream::new(10, 5).bits(4) >> 32) as u32;
         let regions = regions_of(size.into(), box_side, key);
         let [a, b] = [widen(&images[0]), widen(&images[1])];
@@ -250,7 +246,6 @@ fn the_term_is_the_mean_over_the_view_and_over_its_boxes() {
 /// A rounding error of the mean would cause a deviation of 1e-8, and a gradient of 1e8.
 #[test]
 fn a_constant_depth_has_no_correlation_and_no_gradient() {
-    let gpu = gpu();
     let size = [77, 50];
     let [render, depth] = depths(size);
     let constant = |value: f32| vec![value; 77 * 50];
@@ -260,7 +255,7 @@ fn a_constant_depth_has_no_correlation_and_no_gradient() {
         [constant(0.0), constant(0.0)],
         [constant(12345.678), constant(0.1)],
     ] {
-        let (logged, d_render) = evaluate(&gpu, 1.0, 20, size, &images, 0);
+        let (logged, d_render) = evaluate(1.0, 20, size, &images, 0);
         assert_eq!(logged.losses.get(Term::DEPTH), 1.0);
         assert_eq!(logged.losses.get(Term::DEPTH_LOCAL), 1.0);
         assert!(d_render.iter().all(|&d| d == 0.0));
@@ -269,12 +264,11 @@ fn a_constant_depth_has_no_correlation_and_no_gradient() {
 
 #[test]
 fn scale_and_offset_of_the_estimate_do_not_matter() {
-    let gpu = gpu();
     let size = [77, 50];
     let [render, depth] = depths(size);
     let farther: Vec<f32> = depth.iter().map(|d| 5.0 * d + 7.0).collect();
     let [(near, d_near), (far, d_far)] =
-        [depth, farther].map(|depth| evaluate(&gpu, 1.0, 20, size, &[render.clone(), depth], 0));
+        [depth, farther].map(|depth| evaluate(1.0, 20, size, &[render.clone(), depth], 0));
     for term in [Term::DEPTH, Term::DEPTH_LOCAL] {
         assert!((near.losses.get(term) - far.losses.get(term)).abs() < 1e-5);
     }
@@ -283,12 +277,11 @@ fn scale_and_offset_of_the_estimate_do_not_matter() {
 
 #[test]
 fn a_value_that_is_not_finite_reaches_the_log() {
-    let gpu = gpu();
     for (at, value) in [(0, f32::NAN), (1234, f32::NAN), (1234, f32::INFINITY)] {
         let [mut render, depth] = depths([77, 50]);
         render[at] = value;
         let images = [render, depth];
-        let (logged, _) = evaluate(&gpu, 0.1, 128, [77, 50], &images, 0);
+        let (logged, _) = evaluate(0.1, 128, [77, 50], &images, 0);
         assert_eq!(logged.losses.first_not_finite(), Some(Term::DEPTH), "{value} at {at}");
         assert_eq!(logged.status, NOT_FINITE);
     }
@@ -296,11 +289,10 @@ fn a_value_that_is_not_finite_reaches_the_log() {
 
 #[test]
 fn the_same_step_leaves_the_same_bits_and_another_step_other_boxes() {
-    let gpu = gpu();
     let size = [131, 97];
     let images = depths(size);
     let step = |step: u64| {
-        let (logged, d_render) = evaluate(&gpu, 1.0, 24, size, &images, step);
+        let (logged, d_render) = evaluate(1.0, 24, size, &images, step);
         let values = [Term::DEPTH, Term::DEPTH_LOCAL].map(|term| logged.losses.get(term));
         (bits(&values), bits(&d_render))
     };

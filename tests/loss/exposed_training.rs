@@ -76,9 +76,7 @@ fn exposures_that_are_off_leave_no_kernel_and_no_file() {
         config.exposure.learn = learn;
         let gpu = gpu();
         let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
-        let (reports, checked) = trainer.check_step();
-        reports.unwrap();
-        checked.agree().unwrap();
+        let (_, checked) = agreeing_step(&mut trainer);
         let passes = checked.passes.iter().filter(|pass| pass.kernel.starts_with("expos")).count();
         assert_eq!(passes, if learn { 4 } else { 0 });
         run::train(&gpu, &config, &dataset, &out, IfExists::Replace, |_| {}).unwrap();
@@ -136,9 +134,7 @@ fn a_denoiser_on_crops_sees_the_neutral_exposure_and_a_tonemapper_is_refused() {
     config.model.denoiser_crop = 16;
     let gpu = gpu();
     let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
-    let (reports, checked) = trainer.check_step();
-    reports.unwrap();
-    checked.agree().unwrap();
+    agreeing_step(&mut trainer);
     config.model.set_parts(&Part::ALL);
     let error = Trainer::new(&gpu, config, &dataset).unwrap_err().to_string();
     says(&error, &["tonemapper", "exposure.learn"]);

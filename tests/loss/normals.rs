@@ -103,22 +103,26 @@ impl Seen {
         sum / normals.iter().filter(|&&it| it != NO_NORMAL).count().max(1) as f64
     }
 
-    /// The term of a step of weight 1: what it logs, and the gradient of the mean depth over alpha.
-    fn evaluate(&self) -> (Logged, Vec<f32>) {
+    /// The term of a step of weight 1: what it logs, and the gradient of the render.
+    fn step(&self) -> (Logged, Vec<f32>) {
         let gpu = gpu();
-        let colors = 3 * self.depths.len();
-        let render = gpu.buffer("render", &[&vec![9.0; colors], &*self.depths].concat()).unwrap();
+        let colors = vec![9.0; 3 * self.depths.len()];
+        let render = gpu.buffer("render", &[&colors, &*self.depths].concat()).unwrap();
         let transmittances = gpu.buffer("transmittances", &self.transmittances).unwrap();
         let mut d_render = gpu.buffer("d_render", &vec![f32::NAN; render.len()]).unwrap();
         let mut loss = NormalLoss::new(&gpu, 1.0, 10).unwrap();
         loss.add(self.camera(), Some(&self.normals)).unwrap();
         let inputs = term_inputs(self.size, Features::NONE, &render, 1);
         let inputs = nightsplat::loss::TermInputs { transmittances: &transmittances, ..inputs };
-        let (logged, report) = gpu.checked(|| {
-            log_step(&gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log))
-        });
-        report.agree().unwrap();
-        (logged.unwrap(), gpu.read(&d_render).unwrap().split_off(colors))
+        let logged =
+            log_step(&gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log));
+        (logged.unwrap(), gpu.read(&d_render).unwrap())
+    }
+
+    /// [`Seen::step`], checked; of the gradient, that of the mean depth over alpha.
+    fn evaluate(&self) -> (Logged, Vec<f32>) {
+        let (logged, mut d_render) = agreeing(|| self.step()).0;
+        (logged, d_render.split_off(3 * self.depths.len()))
     }
 }
 
@@ -207,18 +211,7 @@ fn a_depth_that_is_not_finite_reaches_the_log() {
         let mut seen = Seen::bumpy([33, 17]);
         seen.depths[8 * 33 + 12] = value;
         seen.transmittances.fill(0.0);
-        let gpu = gpu();
-        let render = [&vec![0.0; 3 * seen.depths.len()], &*seen.depths].concat();
-        let render = gpu.buffer("render", &render).unwrap();
-        let transmittances = gpu.buffer("transmittances", &seen.transmittances).unwrap();
-        let mut d_render = gpu.zeros("d_render", render.len()).unwrap();
-        let mut loss = NormalLoss::new(&gpu, 1.0, 10).unwrap();
-        loss.add(seen.camera(), Some(&seen.normals)).unwrap();
-        let inputs = term_inputs(seen.size, Features::NONE, &render, 1);
-        let inputs = nightsplat::loss::TermInputs { transmittances: &transmittances, ..inputs };
-        let logged =
-            log_step(&gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log));
-        assert_eq!(logged.unwrap().status, NOT_FINITE, "{value}");
+        assert_eq!(seen.step().0.status, NOT_FINITE, "{value}");
     }
 }
 

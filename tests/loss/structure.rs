@@ -25,20 +25,19 @@ fn photograph([width, height]: [u32; 2]) -> Vec<f32> {
     (0..3 * pixels).map(|i| soft(i) + noise[i]).collect()
 }
 
-fn structure_of(gpu: &Gpu, image: &[f32], size: [u32; 2]) -> Vec<f32> {
+fn structure_of(image: &[f32], size: [u32; 2]) -> Vec<f32> {
+    let gpu = gpu();
     let image = gpu.buffer("image", image).unwrap();
     let mut structure = gpu.zeros("structure", image.len() / 3).unwrap();
-    let mut target = StructureTarget::new(gpu).unwrap();
+    let mut target = StructureTarget::new(&gpu).unwrap();
     gpu.run("structure", |pass| target.record(pass, &image, size.into(), &mut structure)).unwrap();
     gpu.read(&structure).unwrap()
 }
 
 #[test]
 fn the_kernels_match_their_references() {
-    let gpu = gpu();
     for size in SIZES {
-        let (structure, report) = gpu.checked(|| structure_of(&gpu, &photograph(size), size));
-        report.agree().unwrap();
+        let (structure, report) = agreeing(|| structure_of(&photograph(size), size));
         assert_eq!(structure.len(), (size[0] * size[1]) as usize);
         let kernels: Vec<&str> = report.passes.iter().map(|pass| pass.kernel).collect();
         let chain = ["ciconv_rows", "ciconv_columns", "ciconv_moments", "ciconv_normalize"];
@@ -49,40 +48,37 @@ fn the_kernels_match_their_references() {
 #[test]
 fn the_structure_agrees_with_pytorch() {
     let torch = Torch::read();
-    let structure = structure_of(&gpu(), torch.get("structure.image"), [31, 24]);
+    let structure = structure_of(torch.get("structure.image"), [31, 24]);
     torch.assert_agrees("structure.target", &structure);
 }
 
 #[test]
 fn a_flat_image_without_a_border_has_no_structure() {
-    let gpu = gpu();
     // Zero padding is an edge: only black has none.
     let size = [40, 30];
-    assert!(structure_of(&gpu, &vec![0.0; 3 * 40 * 30], size).iter().all(|&s| s == 0.0));
-    let gray = structure_of(&gpu, &vec![0.5; 3 * 40 * 30], size);
+    assert!(structure_of(&vec![0.0; 3 * 40 * 30], size).iter().all(|&s| s == 0.0));
+    let gray = structure_of(&vec![0.5; 3 * 40 * 30], size);
     for (i, s) in gray.into_iter().enumerate() {
         let (x, y) = (i % 40, i / 40);
         if (6..34).contains(&x) && (6..24).contains(&y) {
             assert_eq!(s, 0.0, "{x} {y}");
         }
     }
-    assert_eq!(structure_of(&gpu, &[0.7, 0.1, 0.3], [1, 1]), [0.0]);
+    assert_eq!(structure_of(&[0.7, 0.1, 0.3], [1, 1]), [0.0]);
 }
 
 #[test]
 fn a_brighter_image_has_the_same_structure() {
-    let gpu = gpu();
     let image = photograph([33, 17]);
     let half: Vec<f32> = image.iter().map(|x| 0.5 * x).collect();
-    let [full, half] = [image, half].map(|image| structure_of(&gpu, &image, [33, 17]));
+    let [full, half] = [image, half].map(|image| structure_of(&image, [33, 17]));
     assert_close("structure", &half, &full, 2e-3);
 }
 
 #[test]
 fn the_same_image_has_the_same_structure_in_every_bit() {
-    let gpu = gpu();
     let image = photograph([131, 97]);
-    let structure = || bits(&structure_of(&gpu, &image, [131, 97]));
+    let structure = || bits(&structure_of(&image, [131, 97]));
     let first = structure();
     assert!((0..5).all(|_| structure() == first));
 }
@@ -100,21 +96,15 @@ fn a_view_without_pixels_or_with_a_short_buffer_is_refused() {
 }
 
 /// The term on the last plane of a render; returns that plane of the gradient.
-fn evaluate(
-    gpu: &Gpu,
-    weight: f64,
-    size: UVec2,
-    plane: &[f32],
-    structure: &[f32],
-) -> (Logged, Vec<f32>) {
-    let pixels = plane.len();
+fn evaluate(weight: f64, size: UVec2, plane: &[f32], structure: &[f32]) -> (Logged, Vec<f32>) {
+    let (gpu, pixels) = (gpu(), plane.len());
     let render = gpu.buffer("render", &[vec![9.0; 3 * pixels], plane.to_vec()].concat()).unwrap();
     let mut d_render = gpu.buffer("d_render", &vec![5.0f32; 4 * pixels]).unwrap();
-    let mut loss = StructureLoss::new(gpu, weight).unwrap();
+    let mut loss = StructureLoss::new(&gpu, weight).unwrap();
     loss.add(size, gpu.buffer("structure", structure).unwrap()).unwrap();
     let inputs = term_inputs(size, FEATURES, &render, 1);
     let logged =
-        log_step(gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log)).unwrap();
+        log_step(&gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log)).unwrap();
     let d_render = gpu.read(&d_render).unwrap();
     assert!(d_render[..3 * pixels].iter().all(|&d| d == 5.0), "another plane was written");
     (logged, d_render[3 * pixels..].to_vec())
@@ -122,7 +112,6 @@ fn evaluate(
 
 #[test]
 fn the_term_matches_its_reference_and_finite_differences() {
-    let gpu = gpu();
     for size in SIZES {
         let pixels = (size[0] * size[1]) as usize;
         let (render, structure) = (noise(5, pixels, -0.3, 1.3), noise(6, pixels, 0.0, 1.0));
@@ -147,7 +136,7 @@ fn the_term_matches_its_reference_and_finite_differences() {
             weight * differences.sum::<f64>() / pixels as f64
         };
         assert_gradient("structure_l1", &expected, &central_differences(&widen(&render), loss));
-        let (logged, actual) = evaluate(&gpu, weight, size.into(), &render, &structure);
+        let (logged, actual) = evaluate(weight, size.into(), &render, &structure);
         assert_close("d_render", &actual, &expected, 1e-6 * largest(&expected));
         let mean = sum[0] / pixels as f32;
         assert!((logged.losses.get(Term::STRUCTURE) - mean).abs() <= 1e-6 + 1e-6 * mean);
@@ -159,7 +148,7 @@ fn the_term_matches_its_reference_and_finite_differences() {
 fn the_term_agrees_with_pytorch() {
     let torch = Torch::read();
     let (prior, target) = (torch.get("structure.prior"), torch.get("structure.target"));
-    let (logged, d_prior) = evaluate(&gpu(), 1.0, [31, 24].into(), prior, target);
+    let (logged, d_prior) = evaluate(1.0, [31, 24].into(), prior, target);
     torch.assert_agrees("structure.value", &[logged.losses.get(Term::STRUCTURE)]);
     torch.assert_agrees("structure.d_prior", &d_prior);
 }
@@ -167,7 +156,7 @@ fn the_term_agrees_with_pytorch() {
 #[test]
 fn the_gradient_passes_the_clamp_within_its_bounds_only() {
     let (render, structure) = ([-0.1, 0.0, 0.5, 1.0, 1.1], [0.5, 0.5, 0.5, 0.5, 0.5]);
-    let (_, d) = evaluate(&gpu(), 1.0, [5, 1].into(), &render, &structure);
+    let (_, d) = evaluate(1.0, [5, 1].into(), &render, &structure);
     assert_eq!(d, [0.0, -0.2, 0.0, 0.2, 0.0]);
 }
 
@@ -175,7 +164,7 @@ fn the_gradient_passes_the_clamp_within_its_bounds_only() {
 fn a_value_that_is_not_finite_reaches_the_log() {
     let mut render = noise(7, 100, 0.0, 1.0);
     render[57] = f32::NAN;
-    let (logged, _) = evaluate(&gpu(), 1.0, [10, 10].into(), &render, &noise(8, 100, 0.0, 1.0));
+    let (logged, _) = evaluate(1.0, [10, 10].into(), &render, &noise(8, 100, 0.0, 1.0));
     assert_eq!(logged.losses.first_not_finite(), Some(Term::STRUCTURE));
     assert_eq!(logged.status, NOT_FINITE);
 }

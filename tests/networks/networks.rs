@@ -249,8 +249,7 @@ fn with_kept_activations_no_stage_is_recomputed_and_no_bit_changes() {
         denoiser.reserve(size).unwrap();
         let are_kept = denoiser.keep_activations(kept, most).unwrap();
         let images = [&first[..], &second, &d];
-        let (outcome, report) = gpu.checked(|| run_denoiser(&mut denoiser, size, images));
-        report.agree().unwrap();
+        let (outcome, report) = agreeing(|| run_denoiser(&mut denoiser, size, images));
         (outcome, are_kept, convolutions(&report))
     };
     let ([once, a_stage], earlier) = ([2 * stages, 1].map(|n| (n * (repeats + 2)) as usize), 2);
@@ -328,8 +327,7 @@ fn assert_each_factor_is_packed_once(settings: DenoiserSettings, size: UVec2, im
     let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
     denoiser.reserve(size).unwrap();
     assert!(denoiser.keep_activations(size, u64::MAX).unwrap());
-    let (_, report) = gpu.checked(|| run_denoiser(&mut denoiser, size, images));
-    report.agree().unwrap();
+    let (_, report) = agreeing(|| run_denoiser(&mut denoiser, size, images));
     let count = |kernel: &str| {
         let found = report.kernels().into_iter().find(|(name, ..)| *name == kernel);
         found.map_or(0, |(_, count, _)| count)

@@ -275,20 +275,6 @@ fn a_profile_on_the_device_matches_its_reference_and_double_precision() {
     }
 }
 
-#[test]
-fn a_table_goes_through_its_knots_and_rises_where_they_do() {
-    let table = table();
-    for channel in 0..3 {
-        for (x, y) in table.x.iter().zip(&table.y[channel]) {
-            assert!((table.value(*x, channel) - y).abs() < 1e-12);
-        }
-    }
-    let values: Vec<f64> = (0..=2600).map(|i| table.value(f64::from(i) / 1000.0, 0)).collect();
-    assert!(values.windows(2).all(|pair| pair[1] >= pair[0] - 1e-12), "it overshoots");
-    assert_eq!(table.value(9.0, 0), 1.0);
-    assert_eq!(table.value(f64::NAN, 0), 0.0);
-}
-
 /// Grey follows the curve of one value for any lambda, and colours keep their ratios for lambda 1.
 #[test]
 fn the_automatic_curve_is_one_curve_for_grey_and_keeps_the_ratios_of_colours() {

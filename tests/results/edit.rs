@@ -2,19 +2,12 @@
 
 use nightsplat::splats::model::Model;
 
-use crate::common::largest;
 use crate::common::prelude::*;
+use crate::common::{clouds, largest};
 
-/// A cloud of Gaussians of degree 3 around the origin.
+/// A cloud of degree 3, none of whose splats is at a bound below which it does not count.
 fn cloud(count: usize, seed: u64) -> Model {
-    let mut gaussians = Gaussians::zeros(count, 3);
-    let stream = Stream::new(seed, 11);
-    for (index, value) in (0..).zip(&mut gaussians.parameters) {
-        *value = (stream.uniform(index) * 2.0 - 1.0) as f32;
-    }
-    gaussians.log_scales_mut().iter_mut().for_each(|scale| *scale = *scale * 0.5 - 2.5);
-    gaussians.rest_mut().iter_mut().for_each(|value| *value *= 0.3);
-    gaussians.into()
+    clouds::drawn(count, 3, Stream::new(seed, 11)).into()
 }
 
 /// The camera at a distance of 4 from the origin of a world that was turned.

@@ -1,7 +1,10 @@
 //! `nightsplat export` as a shell runs it. The formats are tested next to their encoders.
 
 use nightsplat::glam::Vec3;
+use nightsplat_models::export::streamed::INDEX;
+use nightsplat_models::levels::level;
 
+use crate::common::clouds::cloud;
 use crate::common::command::{Folder, json, says};
 use crate::common::prelude::*;
 
@@ -125,4 +128,30 @@ fn a_failed_export_is_one_line_and_leaves_no_file() {
     }
     fs::remove_file(folder.path("run/model.ply")).unwrap();
     folder.refused("export @run --format spz", 3, &["no model.ply"]);
+}
+
+#[test]
+fn streamed_sog_has_levels_and_its_options_are_refused_for_other_formats() {
+    let folder = Folder::empty();
+    let mut model = cloud(300, 1, 3);
+    model.origin = DVec3::new(1000.0, -5.0, 0.0);
+    ply::save(&model, folder.path("a.ply")).unwrap();
+    let line = folder.succeed("export @a.ply --format streamed-sog --levels 2 --chunk 160");
+    says(&line, &["2 levels of 300, 152 Gaussians in 3 chunks"]);
+    assert_eq!(
+        folder.json(&format!("a.streamed-sog/{INDEX}"))["counts"],
+        serde_json::json!([300, 152])
+    );
+
+    folder.succeed("export @a.ply --format ply --level 1 --chunk 160 --out @b.ply");
+    let half = ply::load(folder.path("b.ply")).unwrap();
+    assert_eq!(half, level(&model, &[model.count], 40, 1).with_sh_degree(3));
+    folder.refuses_all(
+        "2 | export @a.ply --format sog --levels 2 | --level
+         2 | export @a.ply --format streamed-sog --level 1 | --levels
+         2 | export @a.ply --format streamed-sog --levels 0 | --levels 0
+         2 | export @a.ply --format sog --level 16 | --level 16
+         2 | export @a.ply --format sog --chunk 0 | --chunk 0
+         2 | export @a.ply --format streamed-sog --out a.sog | --format sog",
+    );
 }

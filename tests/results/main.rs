@@ -19,8 +19,6 @@ mod other_programs;
 mod power_cut;
 mod profile;
 mod rendered;
-mod report;
 mod run;
 mod scored_later;
-mod streamed;
 mod turned;

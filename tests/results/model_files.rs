@@ -1,6 +1,5 @@
 //! Model files: as initial models, and rendered, scored and exported without a run.
 
-use nightsplat::Error;
 use nightsplat::results::run::load_config;
 use nightsplat::splats::model::Model;
 
@@ -157,47 +156,6 @@ fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_de
     assert_eq!(Model::load(&file).unwrap(), Model::from(shown));
     let (_, message) = workspace.run("eval @run/model.ply --dataset @set", 0);
     says(&message, &["model.ply: does not state its near plane"]);
-}
-
-#[test]
-fn an_invalid_fact_in_a_file_is_an_error_of_one_line() {
-    let folder = Folder::empty();
-    let path = folder.path("model.ply");
-    let problem = |comment: &str| {
-        Model::from(Gaussians::zeros(2, 0)).save(&path).unwrap();
-        // All zeros: the file is text.
-        let text = fs::read_to_string(&path).unwrap();
-        fs::write(&path, text.replacen("element", &format!("comment {comment}\nelement"), 1))
-            .unwrap();
-        let error = Model::load(&path).map(|model| model.near).unwrap_err();
-        assert!(matches!(error, Error::Input { .. }), "{error:?}");
-        let error = error.to_string();
-        let (_, problem) = error.split_once("model.ply: ").unwrap();
-        let fact = problem.strip_suffix("; export the model again");
-        fact.unwrap_or_else(|| panic!("no remedy: {problem}")).to_owned()
-    };
-    let above_0 = ["x", "-1", "0", "NaN", "inf", ""]
-        .map(|near| ("nightsplat near", near, "states near", "a finite number above 0"));
-    for (comment, value, verb, rule) in above_0.into_iter().chain([
-        ("nightsplat max_alpha", "1", "states max_alpha", "a finite number between 0 and 1"),
-        ("world = position +", "1 2", "names the origin", "three finite numbers"),
-    ]) {
-        let expected = format!("line 7 {verb} `{value}`, which is not {rule}");
-        assert_eq!(problem(&format!("{comment} {value}")), expected);
-    }
-    let neither = "line 7 states raw_colors `on`, which is neither true nor false";
-    assert_eq!(problem("nightsplat raw_colors on"), neither);
-    // Facts of later versions are skipped.
-    Model::from(Gaussians::zeros(2, 0)).save(&path).unwrap();
-    let text = fs::read_to_string(&path).unwrap();
-    fs::write(&path, text.replacen("element", "comment nightsplat later 1 2\nelement", 1)).unwrap();
-    assert_eq!(Model::load(&path).unwrap().near, 0.2);
-
-    fs::write(&path, "solid cube").unwrap();
-    let error = Model::load(&path).unwrap_err().to_string();
-    assert!(error.contains("model.ply: is not a model: neither PLY, SPZ nor SOG"), "{error}");
-    let error = Model::load(&folder).unwrap_err().to_string();
-    assert!(error.contains("no config.toml"), "{error}");
 }
 
 #[test]

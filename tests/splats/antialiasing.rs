@@ -41,10 +41,7 @@ fn raised(count: usize, status: u32, rest: StorageFormat) -> [Gaussians; 2] {
     let status = gpu.buffer("status", &[status, 0, 0, 0]).unwrap();
     let cameras = [setup.camera, Setup::seen_by(fisheye(), 1, [40, 30], 0, 1).camera];
     let floor = SmoothingFloor::new(&gpu, 4.0, 0.2, &cameras).unwrap();
-    let (done, report) =
-        gpu.checked(|| gpu.run("floor", |pass| floor.record(pass, &mut on_device, &status)));
-    done.unwrap();
-    report.agree().unwrap();
+    agreeing(|| gpu.run("floor", |pass| floor.record(pass, &mut on_device, &status)).unwrap());
     let mut after = Gaussians::zeros(count, 2);
     after.parameters = on_device.read(&gpu).unwrap();
     [before, after]

@@ -1,5 +1,4 @@
-//! How errors grow: blending with its layers, Adam with its steps, percentiles and means with their pixels; each
-//! against f64, with the promised bound.
+//! How errors grow: blending with its layers, Adam with its steps; each against f64, with the promised bound.
 
 use std::ops::Range;
 
@@ -10,7 +9,6 @@ use nightsplat::reference::rounding::UNIT;
 use nightsplat::reference::splat::Splat;
 use nightsplat::splats::optimizer::{Adam, AdamBuffers, AdamStep, LearningRates};
 use nightsplat_models::attributes::{AttributePlane, PlaneCounts, planes};
-use nightsplat_photographs::tone::percentiles;
 
 use crate::common::prelude::*;
 use crate::common::widen;
@@ -246,21 +244,4 @@ fn adam_stays_with_f64_over_thousands_of_steps() {
 #[ignore = "takes a minute: part of `make stress`"]
 fn adam_stays_with_f64_over_a_hundred_thousand_steps() {
     assert_adam_stays_with_f64(100_000);
-}
-
-/// Ranks above 2^24 include whole numbers that f32 cannot represent.
-#[test]
-fn percentiles_and_means_of_more_than_sixteen_million_pixels_are_exact() {
-    let pixels = (1 << 24) + 12_346;
-    let weight = (8 * (pixels - 1) % 10) as f32 / 10.0;
-    let lower = 8 * (pixels - 1) / 10;
-    assert!(weight > 0.0, "the percentile lies between two ranks");
-    let plane = (0..pixels).map(|i| if pixels - 1 - i <= lower { 0.25 } else { 0.5 });
-    let mut luminances: Vec<f32> = plane.collect();
-    assert_eq!(percentiles(&mut luminances, [8]), [0.25 + 0.25 * weight]);
-    let statistics = Statistics::new(&luminances.repeat(3));
-    let mean = 0.25 * (1.0 + (pixels - 1 - lower) as f64 / pixels as f64);
-    for found in [statistics.mean, statistics.mean_luminance] {
-        assert!((f64::from(found) / mean - 1.0).abs() < 1e-7, "{found}, not {mean}");
-    }
 }

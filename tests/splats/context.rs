@@ -53,9 +53,7 @@ fn every_pass_over_a_context_agrees_with_its_reference() {
     let setup = Setup::new(90, SIZE, 1, 9);
     let [context, trained] = divided(&setup, 33);
     let rest = with(&setup, &trained);
-    let (_, checks) = gpu()
-        .checked(|| Rendered::in_context(&rest, &context).backward(&vec![0.5; 3 * setup.pixels()]));
-    checks.agree().unwrap();
+    agreeing(|| Rendered::in_context(&rest, &context).backward(&vec![0.5; 3 * setup.pixels()]));
 }
 
 #[test]

@@ -26,7 +26,7 @@ fn density_control_matches_its_references() {
         let before = Host::mixed(count);
         let round = Round { rounds_left: 3, ..LAST };
         let ((_, report), passes) =
-            gpu.checked(|| before.densify_seen_from(&cameras, &gpu, settings, round));
+            gpu.checked(|| before.densify_seen_from(&cameras, settings, round));
         passes.agree().unwrap_or_else(|error| panic!("{count} Gaussians, {settings:?}: {error}"));
         for kernel in ["densify_score", "densify_decide", "densify_scatter", "densify_moments"] {
             let ran = passes.passes.iter().any(|pass| pass.kernel == kernel);
@@ -40,10 +40,9 @@ fn density_control_matches_its_references() {
 
 #[test]
 fn a_small_gaussian_with_a_large_gradient_is_cloned() {
-    let gpu = gpu();
     let mut before = Host::calm(3);
     before.pull_at(1);
-    let (after, report) = before.densify(&gpu, SETTINGS, LAST);
+    let (after, report) = before.densify(SETTINGS, LAST);
     assert_eq!(report, DensifyReport { cloned: 1, count: 4, ..Default::default() });
     for (old, new) in [(0, 0), (1, 1), (2, 3)] {
         for (planes, new_planes) in [
@@ -65,11 +64,10 @@ fn a_small_gaussian_with_a_large_gradient_is_cloned() {
 
 #[test]
 fn a_large_gaussian_with_a_large_gradient_is_split_into_two_smaller_ones() {
-    let gpu = gpu();
     let mut before = Host::calm(2);
     before.pull_at(0);
     before.log_scales_mut(0).copy_from_slice(&[0.2f32.ln(), 0.1f32.ln(), 0.01f32.ln()]);
-    let (after, report) = before.densify(&gpu, SETTINGS, LAST);
+    let (after, report) = before.densify(SETTINGS, LAST);
     assert_eq!(report, DensifyReport { split: 1, count: 3, ..Default::default() });
     for i in 0..2 {
         let row = after.row(&after.parameters, i);
@@ -86,7 +84,6 @@ fn a_large_gaussian_with_a_large_gradient_is_split_into_two_smaller_ones() {
 
 #[test]
 fn sampled_positions_have_the_covariance_of_their_parent() {
-    let gpu = gpu();
     let count = 4000;
     let mut before = Host::calm(count);
     let rotation = Quat::from_euler(glam::EulerRot::XYZ, 0.3, 0.7, -0.4);
@@ -98,7 +95,7 @@ fn sampled_positions_have_the_covariance_of_their_parent() {
         before.quat_mut(i).copy_from_slice(&[w, x, y, z]);
         before.log_scales_mut(i).copy_from_slice(&scales.to_array().map(f32::ln));
     }
-    let (after, report) = before.densify(&gpu, SETTINGS, LAST);
+    let (after, report) = before.densify(SETTINGS, LAST);
     assert_eq!(report.cloned, count);
     let draws: Vec<Vec3> = (0..count)
         .map(|i| rotation.inverse() * (after.mean(2 * i + 1) - before.mean(i)) / scales)
@@ -116,28 +113,25 @@ fn sampled_positions_have_the_covariance_of_their_parent() {
 
 #[test]
 fn a_faint_gaussian_is_pruned_even_if_its_gradient_is_large() {
-    let gpu = gpu();
     let mut before = Host::calm(3);
     before.parameters[10 * 3 + 1] = -5.4;
     before.pull_at(1);
-    let (after, report) = before.densify(&gpu, SETTINGS, LAST);
+    let (after, report) = before.densify(SETTINGS, LAST);
     assert_eq!(report, DensifyReport { pruned: 1, count: 2, ..Default::default() });
     assert_eq!(after.row(&after.first, 1), before.row(&before.first, 2));
 }
 
 #[test]
 fn all_gaussians_can_be_pruned() {
-    let gpu = gpu();
     let mut before = Host::calm(70);
     before.parameters[10 * 70..11 * 70].fill(-9.0);
-    let (after, report) = before.densify(&gpu, SETTINGS, LAST);
+    let (after, report) = before.densify(SETTINGS, LAST);
     assert_eq!(report, DensifyReport { pruned: 70, ..Default::default() });
     assert_eq!(after.count, 0);
 }
 
 #[test]
 fn a_gaussian_that_is_not_finite_is_pruned() {
-    let gpu = gpu();
     for (column, value) in [
         (0, f32::NAN),
         (4, f32::INFINITY),
@@ -149,7 +143,7 @@ fn a_gaussian_that_is_not_finite_is_pruned() {
         let mut before = Host::calm(5);
         before.pull_at(2);
         before.parameters[column * 5 + 2] = value;
-        let (after, report) = before.densify(&gpu, SETTINGS, LAST);
+        let (after, report) = before.densify(SETTINGS, LAST);
         assert_eq!(
             (report.pruned, report.count - report.cloned),
             (1, 4),
@@ -161,12 +155,11 @@ fn a_gaussian_that_is_not_finite_is_pruned() {
 
 #[test]
 fn a_quaternion_of_zero_length_samples_along_the_axes() {
-    let gpu = gpu();
     let mut before = Host::calm(1);
     before.pull_at(0);
     before.quat_mut(0).fill(0.0);
     before.log_scales_mut(0).copy_from_slice(&[0.04f32.ln(), -30.0, -30.0]);
-    let (after, _) = before.densify(&gpu, SETTINGS, LAST);
+    let (after, _) = before.densify(SETTINGS, LAST);
     let offset = after.mean(1) - before.mean(0);
     assert!(offset.x != 0.0 && offset.y == 0.0 && offset.z == 0.0, "{offset}");
 }
@@ -174,10 +167,9 @@ fn a_quaternion_of_zero_length_samples_along_the_axes() {
 /// At this step the first uniform sample of this clone has all its bits zero; its logarithm must stay finite.
 #[test]
 fn a_sample_of_all_zero_bits_is_finite() {
-    let gpu = gpu();
     let mut before = Host::calm(1);
     before.pull_at(0);
-    let (after, report) = before.densify(&gpu, SETTINGS, Round { step: 14_117_035, ..LAST });
+    let (after, report) = before.densify(SETTINGS, Round { step: 14_117_035, ..LAST });
     assert_eq!(report.cloned, 1);
     // 5.8 standard deviations: sqrt(2 ln 2^24).
     let distance = after.mean(1).distance(before.mean(0));
@@ -186,25 +178,22 @@ fn a_sample_of_all_zero_bits_is_finite() {
 
 #[test]
 fn a_gaussian_without_a_finite_gradient_is_not_cloned_or_split() {
-    let gpu = gpu();
     let mut before = Host::calm(3);
     before.grad_norm_sums = vec![f32::NAN, 1.0, 7e-4];
     before.visit_counts = vec![1, 0, 4];
-    let (_, report) = before.densify(&gpu, SETTINGS, LAST);
+    let (_, report) = before.densify(SETTINGS, LAST);
     assert_eq!(report, DensifyReport { count: 3, ..Default::default() });
 }
 
 #[test]
 fn growth_up_to_the_limit_goes_to_the_largest_gradients() {
-    let gpu = gpu();
     let mut before = Host::calm(10);
     before.parameters[10 * 10] = -9.0;
     for i in 0..10 {
         before.grad_norm_sums[i] = 0.1 * (i * 3 % 10) as f32 + 0.1;
     }
     // Nine remain; the gradients of all but one rank as 3, 7, 1, 4, 8, 2, 5, 9, 6 times 0.1 + 0.1.
-    let (after, report) =
-        before.densify(&gpu, DensifySettings { max_gaussians: 11, ..SETTINGS }, LAST);
+    let (after, report) = before.densify(DensifySettings { max_gaussians: 11, ..SETTINGS }, LAST);
     assert_eq!(
         report,
         DensifyReport { cloned: 2, pruned: 1, count: 11, refused: 7, ..Default::default() }
@@ -217,23 +206,21 @@ fn growth_up_to_the_limit_goes_to_the_largest_gradients() {
 
 #[test]
 fn the_limit_applies_with_equal_gradients_and_when_it_is_already_exceeded() {
-    let gpu = gpu();
     let mut before = Host::calm(100);
     before.grad_norm_sums.fill(0.3);
     for (limit, most) in [(150, 150), (100, 100), (60, 100), (0, 100), (200, 200)] {
         let settings = DensifySettings { max_gaussians: limit, ..SETTINGS };
-        let (_, report) = before.densify(&gpu, settings, LAST);
+        let (_, report) = before.densify(settings, LAST);
         assert!((100..=most).contains(&report.count), "limit {limit}: {report:?}");
     }
 }
 
 #[test]
 fn the_same_pass_gives_the_same_bits_and_another_step_or_seed_gives_others() {
-    let gpu = gpu();
     let before = Host::mixed(500);
     let bits = |seed: u64, step: u64| -> Vec<u32> {
         let (after, _) =
-            before.densify(&gpu, DensifySettings { seed, ..SETTINGS }, Round { step, ..LAST });
+            before.densify(DensifySettings { seed, ..SETTINGS }, Round { step, ..LAST });
         after.parameters.iter().map(|p| p.to_bits()).collect()
     };
     let first = bits(10, 600);
@@ -302,7 +289,6 @@ fn a_buffer_that_is_too_short_is_refused() {
 
 #[test]
 fn a_gaussian_with_a_large_gradient_of_any_size_is_split_along_its_longest_axis() {
-    let gpu = gpu();
     for scale in [0.2_f32, 0.001] {
         let mut before = Host::calm(3);
         before.pull_at(1);
@@ -312,7 +298,7 @@ fn a_gaussian_with_a_large_gradient_of_any_size_is_split_along_its_longest_axis(
             scale.ln(),
             (0.1 * scale).ln(),
         ]);
-        let (after, report) = before.densify(&gpu, CONSERVING, LAST);
+        let (after, report) = before.densify(CONSERVING, LAST);
         assert_eq!(report, DensifyReport { split: 1, count: 4, ..Default::default() });
         let offsets = [1, 2].map(|i| after.mean(i) - before.mean(1));
         for offset in offsets {
@@ -332,11 +318,10 @@ fn a_gaussian_with_a_large_gradient_of_any_size_is_split_along_its_longest_axis(
 
 #[test]
 fn a_round_uses_its_share_of_the_remaining_gaussians_and_the_last_round_uses_the_rest() {
-    let gpu = gpu();
     let before = Host::ranked(100);
     for (rounds_left, count) in [(1, 130), (2, 115), (4, 108), (30, 101), (1000, 101)] {
         let settings = DensifySettings { max_gaussians: 130, ..CONSERVING };
-        let (_, report) = before.densify(&gpu, settings, Round { rounds_left, ..LAST });
+        let (_, report) = before.densify(settings, Round { rounds_left, ..LAST });
         assert_eq!(report.count, count, "{rounds_left} rounds left");
         assert_eq!(report.refused, 200 - count);
     }
@@ -346,7 +331,7 @@ fn a_round_uses_its_share_of_the_remaining_gaussians_and_the_last_round_uses_the
 fn growth_stops_at_the_limit_that_the_views_set() {
     let before = Host::ranked(100);
     for (most, count) in [(usize::MAX, 200), (130, 130), (100, 100), (0, 100)] {
-        let (_, report) = before.densify(&gpu(), CONSERVING, Round { most, ..LAST });
+        let (_, report) = before.densify(CONSERVING, Round { most, ..LAST });
         assert_eq!((report.count, report.refused), (count, 200 - count), "at most {most}");
     }
 }
@@ -357,7 +342,7 @@ fn large_enough_buffers_are_kept_and_others_grow_with_headroom() {
     let mut host = Host::calm(100);
     (0..10).for_each(|i| host.pull_at(i));
     let plane = |name: &str| gpu.zeros(name, 200 * COLUMNS).unwrap();
-    let mut gaussians = room_for(&gpu, 200);
+    let mut gaussians = room_for(200);
     gaussians.layout.count = 100;
     let mut moments =
         Moments::Single { first: plane("first_moments"), second: plane("second_moments") };
@@ -385,12 +370,10 @@ fn large_enough_buffers_are_kept_and_others_grow_with_headroom() {
 
 #[test]
 fn a_refused_round_is_retried_with_fewer_splits_and_finally_with_none() {
-    let gpu = gpu();
     let mut before = Host::ranked(100);
     before.parameters[10 * 100] = -9.0;
-    let round = |keeps: &mut dyn FnMut(usize) -> f64| {
-        before.densify_as_kept(&[], &gpu, CONSERVING, LAST, keeps)
-    };
+    let round =
+        |keeps: &mut dyn FnMut(usize) -> f64| before.densify_as_kept(&[], CONSERVING, LAST, keeps);
     let mut tried = vec![];
     let (after, report) = round(&mut |count| {
         tried.push(count);
@@ -401,7 +384,7 @@ fn a_refused_round_is_retried_with_fewer_splits_and_finally_with_none() {
     assert_eq!((report.split, report.pruned, report.count), (8, 1, 107));
     // The largest gradients remain, and nothing that a refused attempt wrote is left.
     let limited = DensifySettings { max_gaussians: 107, ..CONSERVING };
-    assert_eq!(after, before.densify(&gpu, limited, LAST).0);
+    assert_eq!(after, before.densify(limited, LAST).0);
     let mut tried = 0;
     let (_, report) = round(&mut |_| {
         tried += 1;
@@ -423,7 +406,6 @@ fn in_depth(opacity: f32, scales: [f32; 3]) -> Host {
 
 #[test]
 fn a_gaussian_whose_halves_would_look_different_to_a_camera_is_not_split() {
-    let gpu = gpu();
     let cameras = [DVec3::new(90.0, 0.0, 0.0), DVec3::ZERO].map(camera_at);
     for (opacity, scales, split) in [
         // Wide in depth: decided by its coverage and opacity.
@@ -436,7 +418,7 @@ fn a_gaussian_whose_halves_would_look_different_to_a_camera_is_not_split() {
     ] {
         let before = in_depth(opacity, scales);
         let round = |settings, cameras: &[Camera]| {
-            before.densify_seen_from(cameras, &gpu, settings, LAST).1.split
+            before.densify_seen_from(cameras, settings, LAST).1.split
         };
         assert_eq!(round(CONSERVING, &cameras), split, "{opacity} {scales:?}");
         // For the first camera it is far out of view, unless it is everywhere.
@@ -454,13 +436,13 @@ fn a_split_within_the_bound_changes_every_view_only_a_little() {
     let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
     let mut renderer = Renderer::new(&gpu, settings).unwrap();
     let mut image = |host: &Host| {
-        let mut planes = room_for(&gpu, host.count);
+        let mut planes = room_for(host.count);
         planes.write(&gpu, &host.parameters).unwrap();
         renderer.reserve(host.count, [&camera]).unwrap();
         renderer.render_image(&planes, &camera, &options).unwrap().data
     };
     let mut mean_square = |before: &Host, cameras: &[Camera]| {
-        let (after, report) = before.densify_seen_from(cameras, &gpu, CONSERVING, LAST);
+        let (after, report) = before.densify_seen_from(cameras, CONSERVING, LAST);
         let (before, after) = (image(before), image(&after));
         let squares = before.iter().zip(&after).map(|(a, b)| f64::from(a - b).powi(2));
         (report.split, squares.sum::<f64>() / before.len() as f64)

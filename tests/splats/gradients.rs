@@ -152,8 +152,7 @@ fn the_gradient_of_a_lamp_on_the_device_is_that_of_the_chain_and_has_the_same_bi
         let d_render: Vec<f32> = chain.d_render.iter().map(|&d| d as f32).collect();
         let gradient = || {
             let mut rendered = setup.render();
-            let (_, report) = gpu.checked(|| rendered.backward(&d_render));
-            report.agree().unwrap();
+            agreeing(|| rendered.backward(&d_render));
             gpu.read(rendered.renderer.lamp_gradients().unwrap()).unwrap()
         };
         let actual = gradient();

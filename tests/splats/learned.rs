@@ -30,40 +30,32 @@ pub(crate) struct Learned {
 
 impl Learned {
     pub(crate) fn new(
-        gpu: &Gpu,
         count: usize,
         shape: Shape,
         [rest, moments]: [StorageFormat; 2],
         frozen_columns: u32,
     ) -> Self {
-        let layout = Layout::new(count, shape, rest);
-        let mut gaussians = DeviceGaussians::uninit(gpu, layout).unwrap();
-        gaussians.write(gpu, &wave(layout.floats().total(), 0.7, 0.3)).unwrap();
-        let trained = layout.batches(gpu).without(frozen_columns);
-        let zeros = |name| trained.zeros(gpu, name).unwrap();
+        let (gpu, layout) = (gpu(), Layout::new(count, shape, rest));
+        let mut gaussians = DeviceGaussians::uninit(&gpu, layout).unwrap();
+        gaussians.write(&gpu, &wave(layout.floats().total(), 0.7, 0.3)).unwrap();
+        let trained = layout.batches(&gpu).without(frozen_columns);
+        let zeros = |name| trained.zeros(&gpu, name).unwrap();
         let moments = match moments {
             StorageFormat::Single => Moments::Single { first: zeros("m"), second: zeros("v") },
             StorageFormat::Half => Moments::Half(zeros("moments")),
         };
         let gradients = wave(layout.floats().total(), 1e-3, 1.0);
-        let gradients = trained.upload(gpu, "gradients", &gradients).unwrap();
-        let camera = Camera {
-            width: 64,
-            height: 48,
-            focal: DVec2::splat(50.0),
-            principal_point: DVec2::new(32.0, 24.0),
-            model: CameraModel::Pinhole,
-            view_from_world: DAffine3::IDENTITY,
-        };
+        let gradients = trained.upload(&gpu, "gradients", &gradients).unwrap();
+        let camera = pinhole([64, 48], 50.0, DAffine3::IDENTITY);
         let camera = gpu.buffer("camera", &[(&Patch::from(&camera)).into()]).unwrap();
         let (status, rates) = (gpu.zeros("status", 1).unwrap(), LearningRates::uniform(1e-3));
-        let (adam, sh_degree) = (Adam::with_frozen(gpu, frozen_columns).unwrap(), shape.sh_degree);
+        let (adam, sh_degree) = (Adam::with_frozen(&gpu, frozen_columns).unwrap(), shape.sh_degree);
         Self { gaussians, moments, gradients, rates, status, sh_degree, adam, camera, trained }
     }
 
-    pub(crate) fn step(&mut self, gpu: &Gpu, step: u64) {
+    pub(crate) fn step(&mut self, step: u64) {
         let layout = self.gaussians.layout;
-        gpu.run("adam", |pass| self.record(pass, step, layout)).unwrap();
+        gpu().run("adam", |pass| self.record(pass, step, layout)).unwrap();
     }
 
     /// Records a step of Gaussians in this layout.
@@ -86,13 +78,13 @@ impl Learned {
     }
 
     /// The parameters.
-    pub(crate) fn parameters(&self, gpu: &Gpu) -> Vec<f32> {
-        self.gaussians.read(gpu).unwrap()
+    pub(crate) fn parameters(&self) -> Vec<f32> {
+        self.gaussians.read(&gpu()).unwrap()
     }
 
     /// Both moments of every parameter; 0 of those that are not trained.
-    pub(crate) fn moments(&self, gpu: &Gpu) -> Vec<[f32; 2]> {
-        let read = |plane: &Buffer<f32>| self.trained.read(gpu, plane).unwrap();
+    pub(crate) fn moments(&self) -> Vec<[f32; 2]> {
+        let read = |plane: &Buffer<f32>| self.trained.read(&gpu(), plane).unwrap();
         match &self.moments {
             Moments::Single { first, second } => {
                 read(first).into_iter().zip(read(second)).map(|(m, v)| [m, v]).collect()
@@ -105,8 +97,8 @@ impl Learned {
     }
 
     /// The bits of parameters and moments.
-    pub(crate) fn bits(&self, gpu: &Gpu) -> Vec<u32> {
-        let moments = self.moments(gpu).into_iter().flatten();
-        self.parameters(gpu).into_iter().chain(moments).map(f32::to_bits).collect()
+    pub(crate) fn bits(&self) -> Vec<u32> {
+        let moments = self.moments().into_iter().flatten();
+        self.parameters().into_iter().chain(moments).map(f32::to_bits).collect()
     }
 }

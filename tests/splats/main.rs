@@ -23,6 +23,5 @@ mod not_finite;
 mod optimizer;
 mod packed_sh;
 mod render;
-mod scene;
 mod sort;
 mod whole_gaussians;

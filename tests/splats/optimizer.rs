@@ -49,8 +49,8 @@ impl Planes {
     }
 
     /// The parameters from the first, and what a step has of the columns from another float on.
-    fn upload(&self, gpu: &Gpu, trained: usize) -> OnDevice {
-        let upload = |name: &str, data: &[f32]| gpu.buffer(name, data).unwrap();
+    fn upload(&self, trained: usize) -> OnDevice {
+        let upload = |name: &str, data: &[f32]| gpu().buffer(name, data).unwrap();
         let (first, second) = (upload("first", &self.first[trained..]), &self.second[trained..]);
         OnDevice {
             parameters: upload("parameters", &self.parameters),
@@ -60,16 +60,16 @@ impl Planes {
     }
 
     /// One step on the device.
-    fn step(&mut self, gpu: &Gpu, step: u64, columns: [u32; 2], status: u32) {
-        let mut on_device = self.upload(gpu, 0);
+    fn step(&mut self, step: u64, columns: [u32; 2], status: u32) {
+        let (gpu, mut on_device) = (gpu(), self.upload(0));
         let status = gpu.buffer("status", &[status]).unwrap();
-        let adam = Adam::new(gpu).unwrap();
+        let adam = Adam::new(&gpu).unwrap();
         gpu.run("adam", |pass| {
             let step = AdamStep { step, rates: &RATES, status: &status };
             adam.record(pass, step, planes(columns), on_device.buffers())
         })
         .unwrap();
-        [self.parameters, self.first, self.second] = on_device.read(gpu);
+        [self.parameters, self.first, self.second] = on_device.read();
     }
 
     /// The same step in the reference.
@@ -118,21 +118,20 @@ impl OnDevice {
     }
 
     /// The parameters and both moments.
-    fn read(&self, gpu: &Gpu) -> [Vec<f32>; 3] {
+    fn read(&self) -> [Vec<f32>; 3] {
         let Moments::Single { first, second } = &self.moments else { panic!("{:?}", self.moments) };
-        [&self.parameters, first, second].map(|planes| gpu.read(planes).unwrap())
+        [&self.parameters, first, second].map(|planes| gpu().read(planes).unwrap())
     }
 }
 
 #[test]
 fn adam_matches_its_reference() {
-    let gpu = gpu();
     for gaussian_count in [0, 1, 255, 1024, 1025, 3001] {
         for (step, column_count) in [(1, COLUMNS), (7, COLUMNS), (1000, 14)] {
             let mut expected = Planes::new(gaussian_count);
             let mut actual = expected.clone();
             expected.reference_step(step, [gaussian_count, column_count]);
-            actual.step(&gpu, step as u64, [gaussian_count, column_count], 0);
+            actual.step(step as u64, [gaussian_count, column_count], 0);
             // Division and square root are within a few ulp, and steps are at most one unit.
             let pairs = [
                 (&actual.parameters, &expected.parameters, 4e-6),
@@ -161,7 +160,7 @@ fn frozen_columns_have_no_moments_and_keep_their_parameters() {
         let before = Planes::new(gaussian_count);
         let begin = (frozen * gaussian_count) as usize;
         let trained = begin / 4 * 4;
-        let mut on_device = before.upload(&gpu, trained);
+        let mut on_device = before.upload(trained);
         let planes = planes([gaussian_count, COLUMNS]);
         let (done, report) = gpu.checked(|| {
             gpu.run("adam", |pass| {
@@ -172,8 +171,8 @@ fn frozen_columns_have_no_moments_and_keep_their_parameters() {
         done.unwrap();
         report.agree().unwrap();
         let mut expected = before.clone();
-        expected.step(&gpu, 3, [gaussian_count, COLUMNS], 0);
-        let [stepped, first, second] = on_device.read(&gpu);
+        expected.step(3, [gaussian_count, COLUMNS], 0);
+        let [stepped, first, second] = on_device.read();
         assert!(stepped[..begin] == before.parameters[..begin]);
         assert!(stepped[begin..] == expected.parameters[begin..]);
         let shared = begin % 4;
@@ -186,13 +185,12 @@ fn frozen_columns_have_no_moments_and_keep_their_parameters() {
 
 #[test]
 fn the_first_step_moves_every_attribute_by_its_own_learning_rate() {
-    let gpu = gpu();
     let count = 5;
     let mut planes = Planes::new(count);
     planes.first.fill(0.0);
     planes.second.fill(0.0);
     let before = planes.clone();
-    planes.step(&gpu, 1, [count, COLUMNS], 0);
+    planes.step(1, [count, COLUMNS], 0);
     for (columns, attribute) in [
         ([0, 2], Attribute::Means),
         ([3, 6], Attribute::Quats),
@@ -214,10 +212,9 @@ fn the_first_step_moves_every_attribute_by_its_own_learning_rate() {
 
 #[test]
 fn columns_beyond_the_count_do_not_change() {
-    let gpu = gpu();
     let mut planes = Planes::new(10);
     let before = planes.clone();
-    planes.step(&gpu, 3, [10, 14], 0);
+    planes.step(3, [10, 14], 0);
     assert_eq!(planes.parameters[140..], before.parameters[140..]);
     assert_eq!(planes.first[140..], before.first[140..]);
     assert_ne!(planes.parameters[139], before.parameters[139]);
@@ -225,10 +222,9 @@ fn columns_beyond_the_count_do_not_change() {
 
 #[test]
 fn nothing_changes_while_the_status_is_set() {
-    let gpu = gpu();
     let mut planes = Planes::new(300);
     let before = planes.bits();
-    planes.step(&gpu, 3, [300, COLUMNS], 4);
+    planes.step(3, [300, COLUMNS], 4);
     assert!(planes.bits() == before);
 }
 
@@ -236,7 +232,6 @@ fn nothing_changes_while_the_status_is_set() {
 /// parameter.
 #[test]
 fn a_gradient_that_is_not_finite_counts_as_zero() {
-    let gpu = gpu();
     let mut expected = Planes::new(64);
     for i in [0, 200, 700, 1000] {
         expected.gradients[i] = 0.0;
@@ -247,27 +242,25 @@ fn a_gradient_that_is_not_finite_counts_as_zero() {
     {
         actual.gradients[i] = value;
     }
-    expected.step(&gpu, 5, [64, COLUMNS], 0);
-    actual.step(&gpu, 5, [64, COLUMNS], 0);
+    expected.step(5, [64, COLUMNS], 0);
+    actual.step(5, [64, COLUMNS], 0);
     assert!(actual.bits() == expected.bits());
 }
 
 #[test]
 fn a_huge_gradient_gives_finite_moments() {
-    let gpu = gpu();
     let mut planes = Planes::new(4);
     planes.gradients.fill(3e30);
-    planes.step(&gpu, 2, [4, COLUMNS], 0);
+    planes.step(2, [4, COLUMNS], 0);
     assert!(planes.second.iter().chain(&planes.parameters).all(|x| x.is_finite()));
 }
 
 #[test]
 fn log_scales_stay_where_exp_is_finite() {
-    let gpu = gpu();
     let mut planes = Planes::new(2);
     planes.parameters.fill(100.0);
     planes.parameters[7 * 2] = -100.0;
-    planes.step(&gpu, 1, [2, COLUMNS], 0);
+    planes.step(1, [2, COLUMNS], 0);
     assert_eq!(planes.parameters[7 * 2..10 * 2], [-30.0, 13.0, 13.0, 13.0, 13.0, 13.0]);
     assert!(
         planes.parameters[..7 * 2].iter().chain(&planes.parameters[10 * 2..]).all(|x| *x > 99.0)
@@ -276,14 +269,13 @@ fn log_scales_stay_where_exp_is_finite() {
 
 #[test]
 fn adam_finds_the_minimum_of_a_parabola() {
-    let gpu = gpu();
     let mut planes = Planes::new(3);
     planes.first.fill(0.0);
     planes.second.fill(0.0);
     planes.parameters.iter_mut().for_each(|p| *p *= 0.2);
     for step in 1..=250 {
         planes.gradients = planes.parameters.iter().map(|p| 2.0 * (p - 0.5)).collect();
-        planes.step(&gpu, step, [3, COLUMNS], 0);
+        planes.step(step, [3, COLUMNS], 0);
     }
     assert!(planes.parameters.iter().all(|p| (p - 0.5).abs() < 0.05), "{:?}", planes.parameters);
 }

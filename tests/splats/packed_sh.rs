@@ -36,10 +36,9 @@ fn steps_in_every_format_match_their_references() {
             {
                 for count in [2, 257] {
                     let shape = Shape { sh_degree, features: features(channels) };
-                    let mut learned = Learned::new(&gpu, count, shape, bits, frozen);
+                    let mut learned = Learned::new(count, shape, bits, frozen);
                     learned.sh_degree = used;
-                    let (_, report) =
-                        gpu.checked(|| (1..=3).for_each(|step| learned.step(&gpu, step)));
+                    let (_, report) = gpu.checked(|| (1..=3).for_each(|step| learned.step(step)));
                     report
                         .agree()
                         .unwrap_or_else(|error| panic!("{bits:?} {count} {shape:?}: {error}"));
@@ -55,14 +54,14 @@ fn moments_in_halves_decay_as_floats_do() {
     let _alone = alone();
     let gpu = gpu();
     let mean = |learned: &Learned| {
-        let moments = learned.moments(&gpu);
+        let moments = learned.moments();
         moments.iter().map(|[_, v]| f64::from(*v)).sum::<f64>() / moments.len() as f64
     };
     let [floats, halves] = [StorageFormat::Single, StorageFormat::Half].map(|bits| {
-        let mut learned = Learned::new(&gpu, 1000, 0.into(), [StorageFormat::Single, bits], 0);
-        learned.step(&gpu, 1);
+        let mut learned = Learned::new(1000, 0.into(), [StorageFormat::Single, bits], 0);
+        learned.step(1);
         gpu.write(&mut learned.gradients, &vec![0.0; 14_000]).unwrap();
-        (2..=250).for_each(|step| learned.step(&gpu, step));
+        (2..=250).for_each(|step| learned.step(step));
         mean(&learned)
     });
     assert!((halves / floats - 1.0).abs() < 0.01, "{halves:e}, not {floats:e}");
@@ -75,8 +74,8 @@ fn coefficients_in_halves_move_by_steps_below_their_precision() {
     let gpu = gpu();
     let count = 300;
     let formats = [StorageFormat::Half, StorageFormat::Single];
-    let mut learned = Learned::new(&gpu, count, 3.into(), formats, 0);
-    let mut parameters = learned.parameters(&gpu);
+    let mut learned = Learned::new(count, 3.into(), formats, 0);
+    let mut parameters = learned.parameters();
     parameters[14 * count..].fill(0.75);
     learned.gaussians.write(&gpu, &parameters).unwrap();
     let gradients: Vec<f32> = (0..count * width(3)).map(|i| 1e-3 + 1e-8 * i as f32).collect();
@@ -84,10 +83,9 @@ fn coefficients_in_halves_move_by_steps_below_their_precision() {
     let rate = 2.4e-5;
     learned.rates = LearningRates::uniform(rate);
     // Equal gradients give equal steps, up or down.
-    learned.step(&gpu, 1);
-    let is_up =
-        learned.moments(&gpu)[14 * count..].iter().map(|[m, _]| *m < 0.0).collect::<Vec<_>>();
-    (2..=40).for_each(|step| learned.step(&gpu, step));
+    learned.step(1);
+    let is_up = learned.moments()[14 * count..].iter().map(|[m, _]| *m < 0.0).collect::<Vec<_>>();
+    (2..=40).for_each(|step| learned.step(step));
     let rest = &learned.gaussians.read(&gpu).unwrap()[14 * count..];
     let moved = |(&value, is_up): (&f32, &bool)| {
         let moved = f64::from(value) - 0.75;
@@ -103,7 +101,7 @@ fn coefficients_in_halves_move_by_steps_below_their_precision() {
 fn coefficients_beyond_the_range_and_gradients_that_are_not_finite_give_finite_halves() {
     let _alone = alone();
     let gpu = gpu();
-    let mut learned = Learned::new(&gpu, 4, 1.into(), [StorageFormat::Half; 2], 0);
+    let mut learned = Learned::new(4, 1.into(), [StorageFormat::Half; 2], 0);
     learned.rates = LearningRates::uniform(1e3);
     let mut planes = vec![1e6; 4 * width(1)];
     planes[14 * 4..14 * 4 + 9]
@@ -112,11 +110,10 @@ fn coefficients_beyond_the_range_and_gradients_that_are_not_finite_give_finite_h
     let wild = [f32::NAN, f32::INFINITY, -f32::INFINITY, 1e38, -1e38, 1e-38];
     let gradients: Vec<f32> = wild.into_iter().cycle().take(4 * width(1)).collect();
     gpu.write(&mut learned.gradients, &gradients).unwrap();
-    let (_, report) = gpu.checked(|| (1..=4).for_each(|step| learned.step(&gpu, step)));
-    report.agree().unwrap();
+    agreeing(|| (1..=4).for_each(|step| learned.step(step)));
     let rest = &learned.gaussians.read(&gpu).unwrap()[14 * 4..];
     assert!(rest.iter().all(|value| value.abs() <= 65504.0), "{rest:?}");
-    assert!(learned.moments(&gpu).iter().flatten().all(|moment| moment.is_finite()));
+    assert!(learned.moments().iter().flatten().all(|moment| moment.is_finite()));
 }
 
 /// Halves represent floats: both give the same values, forward and backward.

@@ -16,9 +16,9 @@ const HALF: [StorageFormat; 2] = [StorageFormat::Half; 2];
 const COLUMNS: usize = 25;
 
 /// Gaussians with two features and SH of degree 1.
-fn learned(gpu: &Gpu, count: usize, formats: [StorageFormat; 2], frozen_columns: u32) -> Learned {
+fn learned(count: usize, formats: [StorageFormat; 2], frozen_columns: u32) -> Learned {
     let shape = Shape { sh_degree: 1, features: features(5) };
-    let mut learned = Learned::new(gpu, count, shape, formats, frozen_columns);
+    let mut learned = Learned::new(count, shape, formats, frozen_columns);
     learned.rates = RATES;
     learned
 }
@@ -26,19 +26,16 @@ fn learned(gpu: &Gpu, count: usize, formats: [StorageFormat; 2], frozen_columns:
 /// A vector of four can begin in a frozen column.
 #[test]
 fn frozen_columns_have_no_moments_and_keep_their_parameters() {
-    let gpu = gpu();
     for (frozen, count) in [(3, 1), (10, 3), (11, 2), (11, 1025), (14, 7)] {
-        let [mut trained, mut whole] =
-            [frozen, 0].map(|frozen| learned(&gpu, count, SINGLE, frozen));
-        let before = trained.parameters(&gpu);
-        let (_, report) = gpu.checked(|| trained.step(&gpu, 3));
-        report.agree().unwrap();
-        whole.step(&gpu, 3);
+        let [mut trained, mut whole] = [frozen, 0].map(|frozen| learned(count, SINGLE, frozen));
+        let before = trained.parameters();
+        agreeing(|| trained.step(3));
+        whole.step(3);
         let begin = frozen as usize * count;
-        let [stepped, expected] = [&trained, &whole].map(|learned| learned.parameters(&gpu));
+        let [stepped, expected] = [&trained, &whole].map(|learned| learned.parameters());
         assert!(stepped[..begin] == before[..begin]);
         assert!(stepped[begin..] == expected[begin..]);
-        let [moments, expected] = [&trained, &whole].map(|learned| learned.moments(&gpu));
+        let [moments, expected] = [&trained, &whole].map(|learned| learned.moments());
         assert!(moments[begin..] == expected[begin..]);
         // Also those of frozen parameters in the first vector.
         assert!(moments[..begin].iter().all(|moments| *moments == [0.0; 2]));
@@ -47,12 +44,11 @@ fn frozen_columns_have_no_moments_and_keep_their_parameters() {
 
 #[test]
 fn the_first_step_moves_every_attribute_by_its_own_learning_rate() {
-    let gpu = gpu();
     let count = 5;
-    let mut learned = learned(&gpu, count, SINGLE, 0);
-    let before = learned.parameters(&gpu);
-    learned.step(&gpu, 1);
-    let after = learned.parameters(&gpu);
+    let mut learned = learned(count, SINGLE, 0);
+    let before = learned.parameters();
+    learned.step(1);
+    let after = learned.parameters();
     for (columns, attribute) in [
         ([0, 2], Attribute::Means),
         ([3, 6], Attribute::Quats),
@@ -71,14 +67,12 @@ fn the_first_step_moves_every_attribute_by_its_own_learning_rate() {
 
 #[test]
 fn coefficients_do_not_change_while_their_degree_is_not_in_use() {
-    let gpu = gpu();
     for formats in [SINGLE, HALF] {
-        let mut learned = learned(&gpu, 10, formats, 0);
+        let mut learned = learned(10, formats, 0);
         learned.sh_degree = 0;
-        let before = learned.parameters(&gpu);
-        let (_, report) = gpu.checked(|| learned.step(&gpu, 3));
-        report.agree().unwrap();
-        let after = learned.parameters(&gpu);
+        let before = learned.parameters();
+        agreeing(|| learned.step(3));
+        let after = learned.parameters();
         assert_eq!(after[160..], before[160..]);
         assert!(after[..160].iter().zip(&before).all(|(after, before)| after != before));
     }
@@ -88,12 +82,11 @@ fn coefficients_do_not_change_while_their_degree_is_not_in_use() {
 fn nothing_changes_while_the_status_is_set() {
     let gpu = gpu();
     for formats in [SINGLE, HALF] {
-        let mut learned = learned(&gpu, 300, formats, 0);
-        let before = learned.bits(&gpu);
+        let mut learned = learned(300, formats, 0);
+        let before = learned.bits();
         gpu.write(&mut learned.status, &[4]).unwrap();
-        let (_, report) = gpu.checked(|| learned.step(&gpu, 3));
-        report.agree().unwrap();
-        assert!(learned.bits(&gpu) == before);
+        agreeing(|| learned.step(3));
+        assert!(learned.bits() == before);
     }
 }
 
@@ -103,7 +96,7 @@ fn a_gradient_that_is_not_finite_counts_as_zero() {
     let gpu = gpu();
     let wild = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -f32::NAN];
     for formats in [SINGLE, HALF] {
-        let [mut expected, mut actual] = [(); 2].map(|()| learned(&gpu, 64, formats, 0));
+        let [mut expected, mut actual] = [(); 2].map(|()| learned(64, formats, 0));
         let mut gradients = gpu.read(&expected.gradients).unwrap();
         // The last three are of colours.
         let indices = [200, 700, 64 * 16, 64 * 18, 64 * 17 + 1];
@@ -112,9 +105,9 @@ fn a_gradient_that_is_not_finite_counts_as_zero() {
                 gradients[i] = if is_wild { value } else { 0.0 };
             }
             gpu.write(&mut learned.gradients, &gradients).unwrap();
-            learned.step(&gpu, 5);
+            learned.step(5);
         }
-        assert!(actual.bits(&gpu) == expected.bits(&gpu), "{formats:?}");
+        assert!(actual.bits() == expected.bits(), "{formats:?}");
     }
 }
 
@@ -123,28 +116,27 @@ fn a_gradient_that_is_not_finite_counts_as_zero() {
 fn a_huge_gradient_gives_finite_moments() {
     let gpu = gpu();
     for formats in [SINGLE, HALF] {
-        let mut learned = learned(&gpu, 4, formats, 0);
-        let mut parameters = learned.parameters(&gpu);
+        let mut learned = learned(4, formats, 0);
+        let mut parameters = learned.parameters();
         parameters[16 * 4..].fill(6e4);
         learned.gaussians.write(&gpu, &parameters).unwrap();
         gpu.write(&mut learned.gradients, &[3e30; 4 * COLUMNS]).unwrap();
-        let (_, report) = gpu.checked(|| learned.step(&gpu, 2));
-        report.agree().unwrap();
-        let moments = learned.moments(&gpu);
+        agreeing(|| learned.step(2));
+        let moments = learned.moments();
         assert!(moments.iter().all(|[m, v]| m.is_finite() && v.is_finite() && *v > 0.0));
-        assert!(learned.parameters(&gpu).iter().all(|x| x.is_finite()));
+        assert!(learned.parameters().iter().all(|x| x.is_finite()));
     }
 }
 
 #[test]
 fn log_scales_stay_where_exp_is_finite() {
     let gpu = gpu();
-    let mut learned = learned(&gpu, 2, SINGLE, 0);
+    let mut learned = learned(2, SINGLE, 0);
     let mut parameters = [100.0; 2 * COLUMNS];
     parameters[7 * 2] = -100.0;
     learned.gaussians.write(&gpu, &parameters).unwrap();
-    learned.step(&gpu, 1);
-    let after = learned.parameters(&gpu);
+    learned.step(1);
+    let after = learned.parameters();
     assert_eq!(after[7 * 2..10 * 2], [-30.0, 13.0, 13.0, 13.0, 13.0, 13.0]);
     assert!(after[..7 * 2].iter().chain(&after[10 * 2..]).all(|x| *x > 99.0));
 }
@@ -154,7 +146,7 @@ fn gaussians_are_refused_if_a_buffer_is_too_short() {
     let gpu = gpu();
     for formats in [SINGLE, HALF] {
         for which in 0..4 {
-            let mut learned = learned(&gpu, 3, formats, 0);
+            let mut learned = learned(3, formats, 0);
             match which {
                 0 => {}
                 1 => learned.gradients = gpu.zeros("gradients", 3 * COLUMNS - 1).unwrap(),
@@ -165,7 +157,7 @@ fn gaussians_are_refused_if_a_buffer_is_too_short() {
             let result = gpu.run("adam", |pass| learned.record(pass, 1, layout));
             assert_eq!(result.is_ok(), which == 0, "{formats:?} {which}");
         }
-        let mut learned = learned(&gpu, 3, formats, 0);
+        let mut learned = learned(3, formats, 0);
         let longer = Layout { count: 4, ..learned.gaussians.layout };
         assert!(gpu.run("adam", |pass| learned.record(pass, 1, longer)).is_err());
     }

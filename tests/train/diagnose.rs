@@ -1,14 +1,13 @@
-//! The diagnosis finds the defects injected into a capture, and the plan follows from them.
+//! The plan follows from the diagnosis, and training from the plan.
 
 use nightsplat::train::Preset;
 use nightsplat::train::plan::Plan;
 use nightsplat_diagnose::Diagnosis;
 use nightsplat_photographs::dataset::{DepthOptions, LoadOptions};
-use nightsplat_photographs::image::srgb_from_linear;
 
 use crate::common::command::{json, unwrapped};
-use crate::common::paths;
 use crate::common::prelude::*;
+use crate::common::sets::{lamp_set, varying};
 
 const VIEWS: usize = 12;
 const SIZE: [u32; 2] = [96, 72];
@@ -31,128 +30,6 @@ fn diagnosis_of(folder: &Path) -> Diagnosis {
 
 fn plan_of(folder: &Path) -> Plan {
     Plan::new(&diagnosis_of(folder), &TrainConfig::default(), MEMORY)
-}
-
-fn diagnosis(capture: &Capture) -> Diagnosis {
-    diagnosis_of(&taken_by(capture))
-}
-
-fn close(found: f64, injected: f64, what: &str) {
-    assert!((found / injected - 1.0).abs() < 0.1, "{what}: {found}, injected {injected}");
-}
-
-/// Replaces every training photograph.
-fn edit(folder: &Path, change: impl Fn(usize, &Image) -> Image) {
-    for (index, path) in paths(&folder.join("low")).iter().enumerate() {
-        change(index, &Image::load(path).unwrap()).save_png8(path).unwrap();
-    }
-}
-
-/// A photograph at four times the size, a third of the light, and with noise: surfaces are wider than the few pixels in
-/// which the noise is measured.
-fn taken(image: &Image, gain: f64, read: f64, index: usize) -> Image {
-    const TIMES: u32 = 4;
-    let noise = Stream::new(7, index as u64);
-    let (width, height) = (TIMES * image.width, TIMES * image.height);
-    let linear = |x: f32, y: f32| -> [f32; 3] {
-        let (x0, y0) = (x.floor(), y.floor());
-        let at = |dx: u32, dy: u32| {
-            let pixel = image.pixel(
-                (x0 as u32 + dx).min(image.width - 1),
-                (y0 as u32 + dy).min(image.height - 1),
-            );
-            pixel.map(|value| linear_from_srgb(value) / 3.0)
-        };
-        let (tx, ty) = (x - x0, y - y0);
-        let [a, b, c, d] = [at(0, 0), at(1, 0), at(0, 1), at(1, 1)];
-        std::array::from_fn(|i| {
-            (1.0 - ty) * ((1.0 - tx) * a[i] + tx * b[i]) + ty * ((1.0 - tx) * c[i] + tx * d[i])
-        })
-    };
-    Image::from_fn(width, height, |x, y| {
-        let signal = linear(x as f32 / TIMES as f32, y as f32 / TIMES as f32);
-        std::array::from_fn(|channel| {
-            let signal = f64::from(signal[channel]);
-            let draw = noise.normal(u64::from(3 * (y * width + x)) + channel as u64);
-            let noisy = signal + (gain * signal + read * read).sqrt() * draw;
-            srgb_from_linear(noisy as f32).clamp(0.0, 1.0)
-        })
-    })
-}
-
-// ---------------------------------------------------------------------------
-// Diagnosis
-
-#[test]
-fn injected_noise_is_found_within_a_tenth() {
-    let set = taken_by(&Capture::clean());
-    let clean: Vec<Image> = (0..VIEWS)
-        .map(|view| Image::load(set.join(format!("low/{view:03}.png"))).unwrap())
-        .collect();
-    for (gain, read) in [(5e-4, 6e-3), (1.5e-3, 1e-2)] {
-        edit(&set, |index, _| taken(&clean[index], gain, read, index));
-        let noise = diagnosis_of(&set).scene.noise.unwrap();
-        close(noise.gain, gain, "gain");
-        close(noise.read, read, "read noise");
-    }
-}
-
-#[test]
-fn injected_darkening_is_found_within_a_tenth() {
-    let light = diagnosis(&Capture::clean()).scene;
-    for darkening in [4.0, 25.0] {
-        let dark = diagnosis(&Capture { darkening, ..Capture::clean() }).scene;
-        close(dark.darkening / light.darkening, darkening, "darkening");
-        assert!(dark.brightening > light.brightening && dark.code_values < light.code_values);
-    }
-    let noisy = diagnosis(&Capture::default()).scene;
-    close(noisy.darkening / light.darkening, Capture::default().darkening, "darkening with noise");
-}
-
-#[test]
-fn an_injected_spread_of_exposures_is_found_within_a_tenth_view_by_view() {
-    let stops = vec![0.0, -1.0, -2.0, 1.0, 0.5];
-    let capture = Capture { darkening: 8.0, stops: stops.clone(), ..Capture::default() };
-    let found = diagnosis(&capture);
-    let injected: Vec<f64> = (found.views.iter())
-        .map(|view| stops[view.name.parse::<usize>().unwrap() % stops.len()])
-        .collect();
-    let mean = injected.iter().sum::<f64>() / injected.len() as f64;
-    let variance = injected.iter().map(|stops| (stops - mean).powi(2)).sum::<f64>();
-    close(found.scene.exposure_spread, (variance / injected.len() as f64).sqrt(), "spread");
-    for (view, injected) in found.views.iter().zip(&injected) {
-        let exposure = view.exposure.unwrap();
-        assert!((exposure - (injected - mean)).abs() < 0.1, "{}: {exposure}", view.name);
-    }
-    assert!(diagnosis(&Capture::default()).scene.exposure_spread < 0.1);
-}
-
-#[test]
-fn a_blurred_photograph_and_one_without_a_pose_are_named() {
-    let set = taken_by(&Capture::clean());
-    // Moved by a few pixels during the exposure, along both axes.
-    let moved = |image: &Image, [dx, dy]: [u32; 2]| {
-        Image::from_fn(SIZE[0], SIZE[1], |x, y| {
-            let [right, bottom] = SIZE.map(|side| side - 1);
-            let steps = 0..9;
-            let pixels = steps
-                .map(|step| image.pixel((x + dx * step).min(right), (y + dy * step).min(bottom)));
-            pixels.fold([0.0; 3], |sum, rgb| std::array::from_fn(|c| sum[c] + rgb[c] / 9.0))
-        })
-    };
-    edit(&set, |index, image| match index {
-        3 => moved(&moved(image, [1, 0]), [0, 1]),
-        _ => image.clone(),
-    });
-    fs::copy(set.join("low/001.png"), set.join("low/stray.png")).unwrap();
-    let found = diagnosis_of(&set);
-    assert_eq!(found.without_pose, ["stray"]);
-    for remark in ["more blurred than the others: 003", "without a pose, not used: stray"] {
-        assert!(found.remarks.iter().any(|text| text.contains(remark)), "{:?}", found.remarks);
-    }
-    let view = |name: &str| found.views.iter().find(|view| view.name == name).unwrap();
-    assert!(view("003").blur > view("002").blur);
-    assert!(view("002").points > 100 && view("002").overlap > 0.5);
 }
 
 // ---------------------------------------------------------------------------
@@ -381,7 +258,7 @@ fn datasets_of_any_kind_have_a_plan_or_one_clear_error() {
     // Black views are left out and named; a dataset of black views alone is refused.
     let set = taken_by(&Capture::default());
     let black = |is: fn(usize) -> bool| {
-        edit(&set, |index, image| {
+        repaint(&set, |index, image| {
             if is(index) {
                 Image::filled(image.width, image.height, [0.0; 3])
             } else {
@@ -409,7 +286,7 @@ fn datasets_of_any_kind_have_a_plan_or_one_clear_error() {
     // The same photograph and camera in every view.
     let set = taken_by(&Capture::default());
     let first = Image::load(set.join("low/001.png")).unwrap();
-    edit(&set, |_, _| first.clone());
+    repaint(&set, |_, _| first.clone());
     let path = set.join("transforms_train.json");
     let mut list = json(fs::read(&path).unwrap());
     let pose = list["frames"][0]["transform_matrix"].clone();
@@ -448,4 +325,77 @@ fn the_library_plans_and_trains_as_the_command_does() {
     let loaded = Dataset::load(&set, &Preset::Draft.load_options().unwrap()).unwrap();
     let planned = Trainer::planned(&gpu, &loaded, Preset::Draft).unwrap();
     assert!(trained(planned) == trained(Trainer::new(&gpu, config, &dataset).unwrap()));
+}
+
+// ---------------------------------------------------------------------------
+// A lamp
+
+#[test]
+fn the_plan_has_a_lamp_and_exposures_each_where_its_cause_is() {
+    let plan = |lamp, capture: &Capture| {
+        let folder = captured(&lamp_set(lamp), capture);
+        let found = diagnosis_of(&folder);
+        let mut config = TrainConfig::default();
+        config.tone.scene_statistics = true;
+        let plan = Plan::new(&found, &config, MEMORY);
+        config.freeze = Some("means,quats,scales,opacities,dc".parse().unwrap());
+        let frozen = Plan::new(&found, &config, MEMORY).lamp;
+        assert!(
+            !frozen.on && frozen.why.contains("colours are frozen") == plan.lamp.on,
+            "{frozen:?}"
+        );
+        (found.scene.lamp.unwrap(), plan)
+    };
+    for (lamp, capture, expected) in [
+        (None, Capture::default(), [false, false]),
+        (None, varying(), [false, true]),
+        (Some(16.0), Capture::default(), [true, false]),
+        (Some(16.0), varying(), [true, true]),
+    ] {
+        let (found, plan) = plan(lamp, &capture);
+        assert_eq!(
+            [plan.lamp.on, plan.exposure.on],
+            expected,
+            "{:?} {:?}",
+            plan.lamp,
+            plan.exposure
+        );
+        assert!(plan.lamp.why.contains("threshold"), "{:?}", plan.lamp);
+        let begins = match lamp {
+            Some(_) => (found.exponent, found.falloff, found.ambient),
+            None => (2.0, [0.0; 2], 0.05),
+        };
+        assert_eq!((plan.lamp.exponent, plan.lamp.falloff, plan.lamp.ambient), begins);
+    }
+}
+
+#[test]
+fn a_run_learns_the_lamp_that_was_found_and_none_where_there_is_none() {
+    for (lamp, learned) in [(Some(16.0), "lamp = true"), (None, "lamp = false")] {
+        let folder = written(&lamp_set(lamp));
+        folder.succeed("train @ --out @run --steps 2");
+        let config = folder.text("run/config.toml");
+        says(&config, &[learned]);
+        assert_eq!(config.contains("scene_statistics = true"), lamp.is_some(), "{config}");
+        let plan: toml::Value = toml::from_str(&folder.text("run/plan.toml")).unwrap();
+        let exponent = plan["lamp"]["exponent"].as_float().unwrap();
+        assert!((exponent - 2.0).abs() < 0.5 && config.contains(&format!("exponent = {exponent}")));
+    }
+}
+
+#[test]
+fn the_command_reports_the_lamp_as_text_json_and_page() {
+    let folder = written(&lamp_set(Some(16.0)));
+    let text = folder.succeed("diagnose @ -v --report @page.html");
+    assert!(text.lines().any(|line| line.starts_with("lamp ") && line.contains(" on ")), "{text}");
+    says(text.lines().next().unwrap(), &["lit by a lamp"]);
+    let whole = unwrapped(&text);
+    says(&whole, &["moves with the camera", "exponent", "beyond exposures", "by distance"]);
+    says(&folder.text("page.html"), &["moves with the camera"]);
+    let json = json(folder.succeed("diagnose @ --json"));
+    let lamp = &json["scene"]["lamp"];
+    for key in ["exponent", "ambient", "d_ref", "r_squared", "stops", "exposure_r_squared"] {
+        assert!(lamp[key].is_f64(), "{key} of {lamp}");
+    }
+    assert_eq!(lamp["falloff"].as_array().unwrap().len(), 2);
 }

@@ -1,82 +1,10 @@
 //! What is odd about photographs is said by every command that looks at them, and corrected where it can be.
 
-use nightsplat_diagnose::Diagnosis;
-use nightsplat_photographs::dataset::{LoadOptions, RowBands, View};
+use nightsplat_photographs::dataset::LoadOptions;
 
 use crate::common::command::unwrapped;
 use crate::common::prelude::*;
-
-/// A dark set whose training photographs are changed by a function of photograph, column, row and linear light.
-fn changed(change: impl Fn(usize, [u32; 2], f64) -> f64) -> Folder {
-    let capture = Capture { darkening: 6.0, ..Capture::default() };
-    let folder = captured(&small_set(16, [96, 72], 4), &capture);
-    relit(&folder, change);
-    folder
-}
-
-fn plain() -> Folder {
-    changed(|_, _, light| light)
-}
-
-/// The distance from the middle, 1 at a corner.
-fn off([x, y]: [u32; 2]) -> f64 {
-    let half = [48.0, 36.0];
-    (f64::from(x) + 0.5 - half[0]).hypot(f64::from(y) + 0.5 - half[1]) / half[0].hypot(half[1])
-}
-
-fn vignetted() -> Folder {
-    changed(|_, at, light| light / (1.0 + off(at).powi(2)).powi(2))
-}
-
-fn diagnosed(folder: &Path) -> (Dataset, Diagnosis) {
-    Diagnosis::load(folder, &LoadOptions::default()).unwrap()
-}
-
-#[test]
-fn a_plain_set_has_no_finding_and_keeps_its_bits() {
-    let folder = plain();
-    let (dataset, found) = diagnosed(&folder);
-    // The synthetic room has views of few edges.
-    let mut remarks = found.remarks.iter().filter(|remark| !remark.contains("more blurred"));
-    assert_eq!(remarks.next(), None);
-    let falloff = found.scene.falloff.unwrap();
-    assert!(!falloff.is_found() && !falloff.is_corrected && falloff.corner > 0.8, "{falloff:?}");
-    let plain = LoadOptions { mask_overlays: false, falloff: Some([0.0; 2]), ..Default::default() };
-    let as_stored = Dataset::load(&folder, &plain).unwrap();
-    for (view, stored) in dataset.views.iter().zip(&as_stored.views) {
-        assert!(view.image == stored.image && view.mask.is_none(), "{}", view.name);
-    }
-}
-
-#[test]
-fn dark_corners_are_measured_and_evened_out_in_memory_and_when_read_again() {
-    let (even, folder) = (plain(), vignetted());
-    let falloff = diagnosed(&folder).1.scene.falloff.unwrap();
-    assert!(falloff.is_found() && falloff.is_corrected, "{falloff:?}");
-    assert!((falloff.corner - 0.25).abs() < 0.06 && falloff.error < 0.1, "{falloff:?}");
-    let uncorrected = LoadOptions { falloff: Some([0.0; 2]), ..LoadOptions::default() };
-    let (_, left) = Diagnosis::load(&folder, &uncorrected).unwrap();
-    assert!(!left.scene.falloff.unwrap().is_corrected);
-    let light = |folder: &Path, options: &LoadOptions| -> Vec<f64> {
-        let dataset = Dataset::load(folder, options).unwrap();
-        let images = dataset.train_views().map(|view| view.loaded().unwrap().unwrap().into_owned());
-        let outer = |image: Image| -> f64 {
-            let pixels = (0..image.height).flat_map(|y| (0..image.width).map(move |x| [x, y]));
-            let light = |[x, y]: [u32; 2]| f64::from(linear_from_srgb(image.pixel(x, y)[1]));
-            pixels.filter(|&at| off(at) > 0.8).map(light).sum()
-        };
-        images.map(outer).collect()
-    };
-    let evened = LoadOptions { falloff: Some(falloff.falloff), ..LoadOptions::default() };
-    let truth = light(&even, &LoadOptions::default());
-    let dark = light(&folder, &LoadOptions::default());
-    let kept = light(&folder, &evened);
-    for ((evened, dark), truth) in kept.iter().zip(dark).zip(truth) {
-        assert!(dark < 0.45 * truth && (evened / truth).log2().abs() < 0.3, "{evened} for {truth}");
-    }
-    let read_again = LoadOptions { keep: Some(0), ..evened };
-    assert_eq!(light(&folder, &read_again), kept);
-}
+use crate::common::sets::{banded, changed, vignetted};
 
 #[test]
 fn a_run_records_what_it_evens_out_and_a_plan_file_repeats_it() {
@@ -101,78 +29,6 @@ fn a_run_records_what_it_evens_out_and_a_plan_file_repeats_it() {
     }
 }
 
-/// Two and a half bands with a third more or less light, elsewhere in each photograph; the light of a row.
-fn band(index: usize, y: f64) -> f64 {
-    1.0 + 0.35 * (std::f64::consts::TAU * y / 28.8 + 2.4 * index as f64).sin()
-}
-
-fn banded() -> Folder {
-    changed(|index, [_, y], light| light * band(index, f64::from(y) + 0.5))
-}
-
-/// The linear light of each row of each training photograph.
-fn light_of_rows(folder: &Path, options: &LoadOptions) -> Vec<Vec<f64>> {
-    let dataset = Dataset::load(folder, options).unwrap();
-    let rows = |view: &View| -> Vec<f64> {
-        let image = view.loaded().unwrap().unwrap();
-        let light = |x, y| f64::from(linear_from_srgb(image.pixel(x, y)[1]));
-        (0..image.height).map(|y| (0..image.width).map(|x| light(x, y)).sum()).collect()
-    };
-    dataset.train_views().map(rows).collect()
-}
-
-#[test]
-fn bands_of_rows_are_measured_and_evened_out_in_memory_and_when_read_again() {
-    let (even, folder) = (plain(), banded());
-    let found = diagnosed(&folder).1.scene.bands.unwrap();
-    assert!(found.is_found() && found.is_corrected, "{found:?}");
-    // log2(1.35 / 0.65) is 1.05.
-    assert!((found.stops - 1.05).abs() < 0.1, "{}", found.stops);
-    assert!((found.rows.count - 2.5).abs() < 0.07, "{}", found.rows.count);
-    let heights = found.rows.waves.values().map(|[c, s]| c.hypot(*s));
-    assert!(heights.clone().count() > 10 && heights.clone().all(|m| (m - 0.35).abs() < 0.08));
-    let left = LoadOptions { bands: Some(RowBands::default()), ..LoadOptions::default() };
-    let (_, kept) = Diagnosis::load(&folder, &left).unwrap();
-    assert!(!kept.scene.bands.unwrap().is_corrected);
-    let evened = LoadOptions { bands: Some(found.rows), ..LoadOptions::default() };
-    let truth = light_of_rows(&even, &LoadOptions::default());
-    let [banded, kept] = [&left, &evened].map(|options| light_of_rows(&folder, options));
-    // The largest difference of a row, stops.
-    let worst = |set: &[Vec<f64>]| -> f64 {
-        let rows = set.iter().flatten().zip(truth.iter().flatten());
-        rows.map(|(one, truth)| (one / truth).log2().abs()).fold(0.0, f64::max)
-    };
-    assert!(worst(&banded) > 0.55 && worst(&kept) < 0.2, "{} {}", worst(&banded), worst(&kept));
-    let read_again = LoadOptions { keep: Some(0), ..evened };
-    assert_eq!(light_of_rows(&folder, &read_again), kept);
-}
-
-#[test]
-fn bands_and_dark_corners_are_told_apart() {
-    let folder = changed(|index, [x, y], light| {
-        light * band(index, f64::from(y) + 0.5) / (1.0 + off([x, y]).powi(2)).powi(2)
-    });
-    let scene = diagnosed(&folder).1.scene;
-    let (bands, falloff) = (scene.bands.unwrap(), scene.falloff.unwrap());
-    assert!(bands.is_corrected && (bands.stops - 1.05).abs() < 0.15, "{bands:?}");
-    assert!(falloff.is_corrected && (falloff.corner - 0.25).abs() < 0.08, "{falloff:?}");
-}
-
-#[test]
-fn weak_bands_and_clean_sets_are_left_as_they_are() {
-    // A fifth of them.
-    let weak = changed(|index, [_, y], light| light * band(index, f64::from(y) + 0.5).powf(0.2));
-    let even = plain();
-    let mut sets = vec![even.to_path_buf(), weak.to_path_buf()];
-    let captures = ["data/lom/chair", "data/lom/sofa", "data/lom/shrub", "data/fox"];
-    sets.extend(captures.iter().filter_map(|set| shared(set)));
-    for set in sets {
-        let bands = diagnosed(&set).1.scene.bands.unwrap();
-        println!("{}: {:.2} {:.2}", set.display(), bands.share, bands.stops);
-        assert!(!bands.is_found() && !bands.is_corrected, "{}: {bands:?}", set.display());
-    }
-}
-
 #[test]
 fn what_is_burnt_in_is_masked_in_every_view_and_said() {
     let bar = |index: usize, [x, y]: [u32; 2], light: f64| match y {
@@ -185,7 +41,7 @@ fn what_is_burnt_in_is_masked_in_every_view_and_said() {
         _ => 0.0,
     };
     let folder = changed(bar);
-    let (dataset, _) = diagnosed(&folder);
+    let dataset = Dataset::load(&folder, &LoadOptions::default()).unwrap();
     for view in dataset.train_views() {
         let mask = view.mask.as_ref().unwrap();
         let is_hidden = |y: usize| mask.weights[96 * y..][..96].iter().all(|&weight| weight == 0.0);

@@ -38,9 +38,7 @@ fn frozen_geometry_keeps_its_bits_and_colours_learn_on_any_device() {
             (config.precision.rest, config.precision.moments) = (format, format);
             let mut trainer = Trainer::new(&gpu, config, &dataset).unwrap();
             let before = trainer.gaussians().unwrap();
-            let (reports, report) = trainer.check_step();
-            reports.unwrap();
-            report.agree().unwrap();
+            agreeing_step(&mut trainer);
             assert_eq!(trainer.trained_floats(), day.count * 59 - day.count * 11 / 4 * 4);
             let reports = advance(&mut trainer, 40);
             // Of as many steps on each of the five views.
@@ -83,9 +81,7 @@ fn frozen_geometry_in_batches_gives_the_bits_of_one_batch_and_resumes() {
         Trainer::new(gpu, config, &dataset).unwrap()
     };
     let (mut expected, mut batched) = (new(&whole), new(&little));
-    let (done, report) = batched.check_step();
-    done.unwrap();
-    report.agree().unwrap();
+    let (_, report) = agreeing_step(&mut batched);
     let passes = report.passes.iter().filter(|pass| pass.kernel == "project_backward");
     assert!(passes.count() > 1);
     for trainer in [&mut expected, &mut batched] {

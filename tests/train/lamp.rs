@@ -54,14 +54,7 @@ fn camera(view: usize) -> Camera {
     let point = DVec3::new(0.4 * number(0), 0.3 * number(1), 2.8 * number(2));
     let turn = DMat3::from_rotation_y(along + 0.6 * number(3));
     let rotation = turn.transpose();
-    Camera {
-        width: SIZE[0],
-        height: SIZE[1],
-        focal: DVec2::splat(44.0),
-        principal_point: DVec2::new(32.0, 24.0),
-        model: CameraModel::Pinhole,
-        view_from_world: DAffine3 { matrix3: rotation, translation: -(rotation * point) },
-    }
+    pinhole(SIZE, 44.0, DAffine3 { matrix3: rotation, translation: -(rotation * point) })
 }
 
 /// Photographs of the gallery in the light of the lamp, and the same views in even light.

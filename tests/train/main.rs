@@ -12,7 +12,6 @@ mod findings;
 mod freeze;
 mod holes;
 mod lamp;
-mod lamp_diagnosis;
 mod parts;
 mod patches;
 mod precision;

@@ -276,23 +276,6 @@ fn normal_maps_are_found_and_turned_and_bad_ones_are_left_out() {
 }
 
 #[test]
-fn float_depth_keeps_its_values_and_its_sign() {
-    let folder = folder(false);
-    let maps = folder.join("estimates");
-    fs::create_dir(&maps).unwrap();
-    let map = Image::from_fn(40, 30, |x, _| [x as f32 - 20.0; 3]);
-    for file in fs::read_dir(folder.join("low")).unwrap() {
-        let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
-        map.save_exr_as_stored(maps.join(format!("{name}.exr"))).unwrap();
-    }
-    let mut config = config(&[Part::Depth]);
-    config.model.depth_folder = Some(maps);
-    let dataset = load(&folder, &config);
-    let depth = dataset.train_views().next().unwrap().depth.clone().unwrap();
-    assert_eq!((depth[0], depth[39]), (-20.0, 19.0));
-}
-
-#[test]
 fn without_depth_maps_there_is_no_depth_part() {
     let config = TrainConfig { steps: 2, ..config(&[Part::Depth, Part::Structure]) };
     let (reports, gaussians) = train(&config, &plain_set(&config));

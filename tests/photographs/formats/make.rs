@@ -1,7 +1,8 @@
 //! `nightsplat PHOTOS`: stopped and killed in each stage, and gone on with by the same command, with a program that
 //! stands in for COLMAP.
 
-use super::pose::{MODELS, photographed, pose, stub};
+use super::pose::pose;
+use super::stub::{MODELS, photographed, stub};
 use super::synthetic::*;
 use crate::common::command::{command, run, says, succeed};
 use crate::common::prelude::*;

@@ -1,139 +1,11 @@
-//! Camera RAW: a minimal file, its linear light, and training on it.
+//! Camera RAW: targets of its light, and training on it.
 
-use nightsplat_photographs::image::srgb_from_linear;
 use nightsplat_photographs::scene_tone::SceneTone;
 use nightsplat_photographs::tone::{InverseTone, MeasuredPhotograph};
 
+use super::dng::{BLACK, NEUTRAL, WHITE, counted, dng, dng_of};
 use crate::common::paths;
 use crate::common::prelude::*;
-
-/// Sensor values without light, and at saturation.
-const BLACK: u16 = 256;
-const WHITE: u16 = 65_280;
-/// Sensor values of white, relative to green.
-const NEUTRAL: [f32; 3] = [0.5, 1.0, 2.0 / 3.0];
-
-/// Sensor value of light.
-fn counted(light: [f32; 3]) -> [u16; 3] {
-    let range = f32::from(WHITE - BLACK);
-    std::array::from_fn(|k| BLACK + (range * NEUTRAL[k] * light[k]).round() as u16)
-}
-
-/// A minimal linear DNG: 16-bit pixels of three colours in one strip, the camera's neutral, black and white levels.
-fn dng(width: u16, height: u16, pixel: impl FnMut(u16, u16) -> [u16; 3]) -> Vec<u8> {
-    dng_of(width, height, false, pixel)
-}
-
-/// [`dng`], or one of a mosaic: red, green; green, blue.
-fn dng_of(
-    width: u16,
-    height: u16,
-    is_mosaic: bool,
-    mut pixel: impl FnMut(u16, u16) -> [u16; 3],
-) -> Vec<u8> {
-    let short = |values: &[u16]| {
-        (
-            3_u16,
-            values.len() as u32,
-            values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>(),
-        )
-    };
-    let rational = |type_: u16, values: &[[i32; 2]]| {
-        (
-            type_,
-            values.len() as u32,
-            values.iter().flatten().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>(),
-        )
-    };
-    let text = |text: &str| (2_u16, text.len() as u32 + 1, [text.as_bytes(), &[0]].concat());
-    let bytes = |values: &[u8]| (1_u16, values.len() as u32, values.to_vec());
-    let long = |value: u32| (4_u16, 1_u32, value.to_le_bytes().to_vec());
-    let pixels: Vec<u8> = (0..height)
-        .flat_map(|y| (0..width).map(move |x| (x, y)))
-        .flat_map(|(x, y)| match is_mosaic {
-            true => vec![pixel(x, y)[usize::from(x % 2 + y % 2)]],
-            false => pixel(x, y).to_vec(),
-        })
-        .flat_map(u16::to_le_bytes)
-        .collect();
-    // From XYZ to the camera's colours, which are sRGB's.
-    let matrix = [32405, -15371, -4985, -9693, 18760, 416, 556, -2040, 10572].map(|v| [v, 10_000]);
-    let samples = if is_mosaic { 1 } else { 3 };
-    let mut entries = vec![
-        (254, long(0)),
-        (256, long(width.into())),
-        (257, long(height.into())),
-        (258, short(&[16; 3][..samples])),
-        (259, short(&[1])),
-        (262, short(&[if is_mosaic { 32803 } else { 34892 }])),
-        (271, text("Test")),
-        (272, text("Linear")),
-        (273, long(8)),
-        (274, short(&[1])),
-        (277, short(&[samples as u16])),
-        (278, long(height.into())),
-        (279, long(pixels.len() as u32)),
-        (284, short(&[1])),
-        (50706, bytes(&[1, 4, 0, 0])),
-        (50707, bytes(&[1, 1, 0, 0])),
-        (50708, text("Test Linear")),
-        (50714, short(&[BLACK; 3][..samples])),
-        (50717, short(&[WHITE; 3][..samples])),
-        (50721, rational(10, &matrix)),
-        (50728, rational(5, &[[1, 2], [1, 1], [2, 3]])),
-        (50778, short(&[21])),
-    ];
-    if is_mosaic {
-        entries.extend([(33421, short(&[2, 2])), (33422, bytes(&[0, 1, 1, 2]))]);
-    }
-    entries.sort_by_key(|(tag, _)| *tag);
-    let directory = 8 + pixels.len();
-    let mut after = directory + 2 + 12 * entries.len() + 4;
-    let mut file = [b"II*\0".as_slice(), &(directory as u32).to_le_bytes(), &pixels].concat();
-    file.extend((entries.len() as u16).to_le_bytes());
-    let mut values = vec![];
-    for (tag, (type_, count, mut value)) in entries {
-        file.extend((tag as u16).to_le_bytes());
-        file.extend(type_.to_le_bytes());
-        file.extend(count.to_le_bytes());
-        if value.len() <= 4 {
-            value.resize(4, 0);
-            file.extend(value);
-        } else {
-            file.extend((after as u32).to_le_bytes());
-            value.resize(value.len().next_multiple_of(2), 0);
-            after += value.len();
-            values.extend(value);
-        }
-    }
-    file.extend([0; 4]);
-    file.extend(values);
-    file
-}
-
-#[test]
-fn a_linear_dng_is_linear_light_with_the_cameras_white() {
-    let folder = Folder::empty();
-    let path = folder.join("a.dng");
-    // Grey of known light, 1/16 to 1/2, by a camera with weaker red and blue.
-    let light = |x: u16| 1.0 / f32::from(16_u16 >> (x / 4));
-    fs::write(&path, dng(16, 8, |x, _| counted([light(x); 3]))).unwrap();
-    let image = Image::load(&path).unwrap();
-    assert_eq!((image.width, image.height), (16, 8));
-    assert_eq!(Image::size_of(&path).unwrap(), (16, 8));
-    for x in [1, 5, 9, 13] {
-        let expected = srgb_from_linear(light(x));
-        for value in image.pixel(x.into(), 4) {
-            assert!((value - expected).abs() < 2e-4, "{x}: {value}, not {expected}");
-        }
-    }
-    // Linear light is processed as in EXR: the same photograph from either file.
-    let exr = folder.join("a.exr");
-    image.save_exr(&exr).unwrap();
-    let other = Image::load(&exr).unwrap();
-    let off = image.data.iter().zip(&other.data).map(|(a, b)| (a - b).abs());
-    assert!(off.fold(0.0, f32::max) < 1e-5);
-}
 
 /// A signal of a part of the noise, in a set of views: its mean, over all pixels, in standard deviations of the noise.
 /// Cut at black, it would be .40 for no light, and .08 too much for light of one standard deviation.
@@ -194,41 +66,6 @@ fn noise_at_black_keeps_its_mean_through_loading_and_the_target() {
                 assert!(signal > 0.0 || found.abs() < error, "{channel}: {found}");
             }
         }
-    }
-}
-
-/// Below white, light comes back, also beyond white of another channel; a pixel with a channel at the sensor's white is
-/// limited to the smallest white of a channel after white balance.
-#[test]
-fn highlights_keep_their_light_up_to_the_sensors_white_and_are_white_there() {
-    let folder = Folder::empty();
-    let path = folder.join("a.dng");
-    let cases: [([f32; 3], [f32; 3]); 6] = [
-        ([0.9; 3], [0.9; 3]),
-        ([1.5, 0.8, 0.3], [1.5, 0.8, 0.3]),
-        ([0.2, 0.5, 1.2], [0.2, 0.5, 1.2]),
-        ([2.0, 1.0, 1.5], [1.0; 3]),
-        ([1.2, 1.0, 1.5], [1.0; 3]),
-        ([2.0, 0.4, 0.2], [1.0, 0.4, 0.2]),
-    ];
-    for (planted, expected) in cases {
-        fs::write(&path, dng(16, 8, |_, _| counted(planted))).unwrap();
-        let found = Image::load(&path).unwrap().pixel(7, 3).map(linear_from_srgb);
-        for (found, expected) in found.into_iter().zip(expected) {
-            assert!((found - expected).abs() < 1e-3, "{planted:?}: {found}, not {expected}");
-        }
-    }
-}
-
-#[test]
-fn a_damaged_raw_is_named() {
-    let folder = Folder::empty();
-    let path = folder.join("a.dng");
-    let whole = dng(16, 8, |_, _| [1000; 3]);
-    for bytes in [&b"no photograph"[..], &whole[..whole.len() / 2], &whole[..100]] {
-        fs::write(&path, bytes).unwrap();
-        let message = Image::load(&path).unwrap_err().to_string();
-        assert!(message.contains("a.dng") && !message.contains('\n'), "{message}");
     }
 }
 

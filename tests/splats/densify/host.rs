@@ -36,20 +36,13 @@ pub(super) fn shape() -> Shape {
     shape
 }
 
-pub(super) fn room_for(gpu: &Gpu, count: usize) -> DeviceGaussians {
-    DeviceGaussians::uninit(gpu, Layout::new(count, shape(), StorageFormat::Single)).unwrap()
+pub(super) fn room_for(count: usize) -> DeviceGaussians {
+    DeviceGaussians::uninit(&gpu(), Layout::new(count, shape(), StorageFormat::Single)).unwrap()
 }
 
 /// A camera of 64 x 48 pixels that looks along +z.
 pub(super) fn camera_at(position: DVec3) -> Camera {
-    Camera {
-        width: 64,
-        height: 48,
-        focal: DVec2::splat(60.0),
-        principal_point: DVec2::new(32.0, 24.0),
-        model: CameraModel::Pinhole,
-        view_from_world: DAffine3::from_translation(-position),
-    }
+    pinhole([64, 48], 60.0, DAffine3::from_translation(-position))
 }
 
 /// Gaussians, their moments and their statistics in host memory.
@@ -131,37 +124,31 @@ impl Host {
             .collect()
     }
 
-    pub(super) fn densify(
-        &self,
-        gpu: &Gpu,
-        settings: DensifySettings,
-        round: Round,
-    ) -> (Self, DensifyReport) {
-        self.densify_seen_from(&[], gpu, settings, round)
+    pub(super) fn densify(&self, settings: DensifySettings, round: Round) -> (Self, DensifyReport) {
+        self.densify_seen_from(&[], settings, round)
     }
 
     pub(super) fn densify_seen_from(
         &self,
         cameras: &[Camera],
-        gpu: &Gpu,
         settings: DensifySettings,
         round: Round,
     ) -> (Self, DensifyReport) {
-        self.densify_as_kept(cameras, gpu, settings, round, |_| 1.0)
+        self.densify_as_kept(cameras, settings, round, |_| 1.0)
     }
 
     /// The same, with `keeps` giving the share of the splits to keep for a number of Gaussians.
     pub(super) fn densify_as_kept(
         &self,
         cameras: &[Camera],
-        gpu: &Gpu,
         settings: DensifySettings,
         round: Round,
         mut keeps: impl FnMut(usize) -> f64,
     ) -> (Self, DensifyReport) {
-        let mut gaussians = room_for(gpu, self.count);
-        let batches = Batches::new(gpu, gaussians.layout.floats());
-        let planes = |data: &[f32]| batches.upload(gpu, "planes", data).unwrap();
+        let gpu = gpu();
+        let mut gaussians = room_for(self.count);
+        let batches = Batches::new(&gpu, gaussians.layout.floats());
+        let planes = |data: &[f32]| batches.upload(&gpu, "planes", data).unwrap();
         gaussians.parameters = planes(&self.parameters);
         let mut moments =
             Moments::Single { first: planes(&self.first), second: planes(&self.second) };
@@ -171,7 +158,7 @@ impl Host {
             visit_counts: &mut gpu.buffer("visit_counts", &self.visit_counts).unwrap(),
             gradients: &mut planes(&vec![f32::NAN; self.count * COLUMNS]),
         };
-        let mut densifier = Densifier::new(gpu, settings, cameras).unwrap();
+        let mut densifier = Densifier::new(&gpu, settings, cameras).unwrap();
         let keeps = |new: GaussianSlice<'_>| {
             assert!(new.parameters.len() >= new.layout.count * COLUMNS);
             Ok(keeps(new.layout.count))
@@ -179,9 +166,9 @@ impl Host {
         let report = densifier.densify(&mut gaussians, inputs, round, keeps).unwrap();
         assert_eq!(report.count, gaussians.layout.count);
         let Moments::Single { first, second } = &moments else { panic!() };
-        let batches = Batches::new(gpu, gaussians.layout.floats());
+        let batches = Batches::new(&gpu, gaussians.layout.floats());
         let read = |buffer| {
-            let planes = batches.read(gpu, buffer).unwrap();
+            let planes = batches.read(&gpu, buffer).unwrap();
             assert_eq!(planes.len(), report.count * COLUMNS);
             planes
         };

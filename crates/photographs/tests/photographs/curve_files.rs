@@ -143,3 +143,19 @@ fn between_its_knots_a_table_is_the_monotone_cubic() {
     // Flat at a peak, and half way between two flat knots half way up.
     is_near(table([0.0, 0.6, 0.4, 0.5]).value(0.25, 0), 0.5);
 }
+
+#[test]
+fn a_table_goes_through_its_knots_and_rises_where_they_do() {
+    let y =
+        vec![vec![0.0, 0.3, 0.5, 0.5, 0.8, 1.0], vec![0.1; 6], vec![1.0, 0.9, 0.3, 0.2, 0.1, 0.0]];
+    let table = Table { is_of_stored: false, x: vec![0.0, 0.1, 0.5, 0.6, 1.0, 2.5], y };
+    for channel in 0..3 {
+        for (x, y) in table.x.iter().zip(&table.y[channel]) {
+            assert!((table.value(*x, channel) - y).abs() < 1e-12);
+        }
+    }
+    let values: Vec<f64> = (0..=2600).map(|i| table.value(f64::from(i) / 1000.0, 0)).collect();
+    assert!(values.windows(2).all(|pair| pair[1] >= pair[0] - 1e-12), "it overshoots");
+    assert_eq!(table.value(9.0, 0), 1.0);
+    assert_eq!(table.value(f64::NAN, 0), 0.0);
+}

@@ -3,13 +3,17 @@
 mod as_it_is;
 mod bad_input;
 mod colours;
+#[cfg(feature = "raw")]
+mod dng;
 mod keys;
 mod layouts;
 mod levels;
 mod models;
 mod photographs;
+#[cfg(feature = "raw")]
+mod raw;
 mod real;
-mod synthetic;
+pub(crate) mod synthetic;
 mod turned;
 
 use std::fs;

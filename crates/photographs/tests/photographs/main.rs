@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
+#[path = "../../../../tests/common/arbitrary.rs"]
+mod arbitrary;
 #[path = "../../../../tests/common/files.rs"]
 mod common;
 #[path = "../../../../tests/common/grid.rs"]
@@ -17,4 +19,5 @@ mod exposure;
 mod expressions;
 mod formats;
 mod metrics;
+mod properties;
 mod tone;

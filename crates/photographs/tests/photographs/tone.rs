@@ -361,3 +361,20 @@ fn a_fixed_gain_replaces_an_automatic_one_and_keeps_full_resolution() {
     let tone_mapped = ToneSettings { full_resolution: true, ..ap3 };
     assert_eq!(fixed(tone_mapped.clone()), ToneSettings { gain_c: 2.0, ..tone_mapped });
 }
+
+/// Ranks above 2^24 include whole numbers that f32 cannot represent.
+#[test]
+fn percentiles_and_means_of_more_than_sixteen_million_pixels_are_exact() {
+    let pixels = (1 << 24) + 12_346;
+    let weight = (8 * (pixels - 1) % 10) as f32 / 10.0;
+    let lower = 8 * (pixels - 1) / 10;
+    assert!(weight > 0.0, "the percentile lies between two ranks");
+    let plane = (0..pixels).map(|i| if pixels - 1 - i <= lower { 0.25 } else { 0.5 });
+    let mut luminances: Vec<f32> = plane.collect();
+    assert_eq!(percentiles(&mut luminances, [8]), [0.25 + 0.25 * weight]);
+    let statistics = Statistics::new(&luminances.repeat(3));
+    let mean = 0.25 * (1.0 + (pixels - 1 - lower) as f64 / pixels as f64);
+    for found in [statistics.mean, statistics.mean_luminance] {
+        assert!((f64::from(found) / mean - 1.0).abs() < 1e-7, "{found}, not {mean}");
+    }
+}

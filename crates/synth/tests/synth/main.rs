@@ -4,6 +4,8 @@
 
 #[path = "../../../../tests/common/files.rs"]
 mod common;
+#[path = "../../../../tests/common/sets.rs"]
+mod sets;
 
 mod lamp;
 mod night;
@@ -14,19 +16,8 @@ use std::path::Path;
 
 use nightsplat_photographs::dataset::{Dataset, LoadOptions};
 use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb};
-use nightsplat_synth::{Capture, SyntheticOptions};
 
-use common::Folder;
-
-fn written(options: &SyntheticOptions) -> Folder {
-    captured(options, &Capture::default())
-}
-
-fn captured(options: &SyntheticOptions, capture: &Capture) -> Folder {
-    let folder = Folder::empty();
-    nightsplat_synth::write_captured(&folder, options, capture).unwrap();
-    folder
-}
+use sets::{captured, written};
 
 fn loaded(folder: &Path) -> Dataset {
     Dataset::load(folder, &LoadOptions::default()).unwrap()

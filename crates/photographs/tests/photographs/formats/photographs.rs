@@ -1,5 +1,7 @@
 //! Photograph files: formats, orientation, alpha and masks.
 
+use nightsplat_photographs::dataset::DepthOptions;
+
 use super::*;
 
 /// The values of one row of pixels.
@@ -211,4 +213,19 @@ fn a_mask_of_another_aspect_ratio_is_refused_and_a_full_mask_excludes_its_view()
     );
     half_mask(&root.join("masks/v01.png"), (30, 30));
     refuses(root, &["masks/v01.png: is 30x30, its photograph 40x30"]);
+}
+
+#[test]
+fn float_depth_keeps_its_values_and_its_sign() {
+    let folder = Folder::lom();
+    let maps = folder.join("estimates");
+    fs::create_dir(&maps).unwrap();
+    let map = Image::from_fn(SIZE.0, SIZE.1, |x, _| [x as f32 - 20.0; 3]);
+    for index in 0..10 {
+        map.save_exr_as_stored(maps.join(name(index)).with_extension("exr")).unwrap();
+    }
+    let depth = DepthOptions { load: true, folder: Some(maps), ..DepthOptions::default() };
+    let dataset = load_with(&folder, LoadOptions { depth, ..LoadOptions::default() });
+    let depth = dataset.train_views().next().unwrap().depth.clone().unwrap();
+    assert_eq!((depth[0], depth[39]), (-20.0, 19.0));
 }

@@ -1,29 +1,18 @@
 //! A lamp that moves with the camera is told apart from everything else that makes a point differ between its views.
 
-use nightsplat::train::plan::Plan;
+use std::fs;
+use std::path::Path;
+
 use nightsplat_diagnose::{Diagnosis, LampDiagnosis, SceneDiagnosis};
-use nightsplat_photographs::dataset::LoadOptions;
+use nightsplat_photographs::dataset::{Dataset, LoadOptions};
+use nightsplat_synth::{Capture, SyntheticOptions};
+use serde_json::Value;
 
-use crate::common::command::{json, unwrapped};
-use crate::common::prelude::*;
-
-/// Of a room.
-fn set(lamp: Option<f64>) -> SyntheticOptions {
-    SyntheticOptions { views: 20, width: 96, height: 72, seed: 4, lamp, ..Default::default() }
-}
-
-/// Exposures that have nothing to do with where the cameras are.
-fn varying() -> Capture {
-    Capture { stops: vec![0.0, -1.0, 0.6, -0.4, 0.3, 0.8, -0.7], ..Capture::default() }
-}
-
-fn diagnosis(folder: &Path) -> Diagnosis {
-    let options = LoadOptions::default();
-    Diagnosis::new(&Dataset::load(folder, &options).unwrap(), &options).unwrap()
-}
+use crate::sets::{captured, lamp_set, relit, varying, written};
 
 fn scene(folder: &Path) -> SceneDiagnosis {
-    diagnosis(folder).scene
+    let options = LoadOptions::default();
+    Diagnosis::new(&Dataset::load(folder, &options).unwrap(), &options).unwrap().scene
 }
 
 fn lamp_of(options: &SyntheticOptions, capture: &Capture) -> LampDiagnosis {
@@ -39,7 +28,8 @@ fn off([x, y]: [u32; 2]) -> f64 {
 #[test]
 fn a_lamp_alone_is_found_and_has_the_inverse_square_law() {
     for (seed, degrees) in [(1, 16.0), (2, 30.0)] {
-        let lamp = lamp_of(&SyntheticOptions { seed, ..set(Some(degrees)) }, &Capture::default());
+        let lamp =
+            lamp_of(&SyntheticOptions { seed, ..lamp_set(Some(degrees)) }, &Capture::default());
         println!("{degrees}: {lamp:?}");
         assert!(lamp.is_found(), "{lamp:?}");
         assert!((lamp.exponent - 2.0).abs() < 0.5, "{lamp:?}");
@@ -54,7 +44,7 @@ fn a_lamp_alone_is_found_and_has_the_inverse_square_law() {
 
 #[test]
 fn a_lamp_with_other_exposures_is_found_beside_them() {
-    let lamp = lamp_of(&set(Some(16.0)), &varying());
+    let lamp = lamp_of(&lamp_set(Some(16.0)), &varying());
     println!("{lamp:?}");
     assert!(lamp.is_found() && (lamp.exponent - 2.0).abs() < 0.5, "{lamp:?}");
     assert!(lamp.r_squared > lamp.lamp_r_squared + 0.2, "{lamp:?}");
@@ -63,7 +53,7 @@ fn a_lamp_with_other_exposures_is_found_beside_them() {
 
 #[test]
 fn exposures_alone_are_no_lamp() {
-    let lamp = lamp_of(&set(None), &varying());
+    let lamp = lamp_of(&lamp_set(None), &varying());
     println!("{lamp:?}");
     assert!(!lamp.is_found() && lamp.stops < 0.1, "{lamp:?}");
     assert!(lamp.exposure_r_squared > 0.8, "{lamp:?}");
@@ -73,7 +63,7 @@ fn exposures_alone_are_no_lamp() {
 fn noise_alone_is_no_lamp() {
     for (seed, full_well) in [(1, 9000.0), (2, 900.0), (3, 200.0)] {
         let grainy = Capture { full_well, ..Capture::default() };
-        let scene = scene(&captured(&SyntheticOptions { seed, ..set(None) }, &grainy));
+        let scene = scene(&captured(&SyntheticOptions { seed, ..lamp_set(None) }, &grainy));
         println!("{:?} {:?}", scene.lamp, scene.lamp_unknown);
         let lamp = scene.lamp.filter(|lamp| lamp.is_found() || lamp.stops > 0.1);
         assert_eq!(lamp, None);
@@ -94,7 +84,7 @@ fn light_that_falls_on_a_place_is_no_lamp() {
 
 #[test]
 fn a_vignette_is_no_lamp() {
-    let folder = written(&set(None));
+    let folder = written(&lamp_set(None));
     relit(&folder, |_, at, light| light * (-2.0 * off(at) * off(at)).exp2());
     let lamp = scene(&folder).lamp.unwrap();
     println!("{lamp:?}");
@@ -110,7 +100,7 @@ fn clipped_photographs_few_views_and_one_position_measure_no_lamp() {
         let told = scene.lamp_unknown.unwrap();
         assert!(told.contains(why), "{told}");
     };
-    let folder = written(&set(Some(16.0)));
+    let folder = written(&lamp_set(Some(16.0)));
     let path = folder.join("transforms_train.json");
     let whole = fs::read(&path).unwrap();
     let list = || -> Value { serde_json::from_slice(&whole).unwrap() };
@@ -124,7 +114,7 @@ fn clipped_photographs_few_views_and_one_position_measure_no_lamp() {
     relit(&folder, |_, _, light| 1e4 * light);
     unknown(&folder, "are unclipped");
 
-    let folder = written(&set(Some(16.0)));
+    let folder = written(&lamp_set(Some(16.0)));
     let path = folder.join("transforms_train.json");
     let points = Dataset::load(&folder, &LoadOptions::default()).unwrap().points;
     fs::remove_dir_all(folder.join("colmap_sparse")).unwrap();
@@ -145,74 +135,4 @@ fn clipped_photographs_few_views_and_one_position_measure_no_lamp() {
     );
     fs::write(folder.join("points3D.ply"), header + &lines).unwrap();
     unknown(&folder, "differ by 0.0 %");
-}
-
-#[test]
-fn the_plan_has_a_lamp_and_exposures_each_where_its_cause_is() {
-    let plan = |lamp, capture: &Capture| {
-        let folder = captured(&set(lamp), capture);
-        let found = diagnosis(&folder);
-        let mut config = TrainConfig::default();
-        config.tone.scene_statistics = true;
-        let plan = Plan::new(&found, &config, 8 << 30);
-        config.freeze = Some("means,quats,scales,opacities,dc".parse().unwrap());
-        let frozen = Plan::new(&found, &config, 8 << 30).lamp;
-        assert!(
-            !frozen.on && frozen.why.contains("colours are frozen") == plan.lamp.on,
-            "{frozen:?}"
-        );
-        (found.scene.lamp.unwrap(), plan)
-    };
-    for (lamp, capture, expected) in [
-        (None, Capture::default(), [false, false]),
-        (None, varying(), [false, true]),
-        (Some(16.0), Capture::default(), [true, false]),
-        (Some(16.0), varying(), [true, true]),
-    ] {
-        let (found, plan) = plan(lamp, &capture);
-        assert_eq!(
-            [plan.lamp.on, plan.exposure.on],
-            expected,
-            "{:?} {:?}",
-            plan.lamp,
-            plan.exposure
-        );
-        assert!(plan.lamp.why.contains("threshold"), "{:?}", plan.lamp);
-        let begins = match lamp {
-            Some(_) => (found.exponent, found.falloff, found.ambient),
-            None => (2.0, [0.0; 2], 0.05),
-        };
-        assert_eq!((plan.lamp.exponent, plan.lamp.falloff, plan.lamp.ambient), begins);
-    }
-}
-
-#[test]
-fn a_run_learns_the_lamp_that_was_found_and_none_where_there_is_none() {
-    for (lamp, learned) in [(Some(16.0), "lamp = true"), (None, "lamp = false")] {
-        let folder = written(&set(lamp));
-        folder.succeed("train @ --out @run --steps 2");
-        let config = folder.text("run/config.toml");
-        says(&config, &[learned]);
-        assert_eq!(config.contains("scene_statistics = true"), lamp.is_some(), "{config}");
-        let plan: toml::Value = toml::from_str(&folder.text("run/plan.toml")).unwrap();
-        let exponent = plan["lamp"]["exponent"].as_float().unwrap();
-        assert!((exponent - 2.0).abs() < 0.5 && config.contains(&format!("exponent = {exponent}")));
-    }
-}
-
-#[test]
-fn the_command_reports_the_lamp_as_text_json_and_page() {
-    let folder = written(&set(Some(16.0)));
-    let text = folder.succeed("diagnose @ -v --report @page.html");
-    assert!(text.lines().any(|line| line.starts_with("lamp ") && line.contains(" on ")), "{text}");
-    says(text.lines().next().unwrap(), &["lit by a lamp"]);
-    let whole = unwrapped(&text);
-    says(&whole, &["moves with the camera", "exponent", "beyond exposures", "by distance"]);
-    says(&folder.text("page.html"), &["moves with the camera"]);
-    let json = json(folder.succeed("diagnose @ --json"));
-    let lamp = &json["scene"]["lamp"];
-    for key in ["exponent", "ambient", "d_ref", "r_squared", "stops", "exposure_r_squared"] {
-        assert!(lamp[key].is_f64(), "{key} of {lamp}");
-    }
-    assert_eq!(lamp["falloff"].as_array().unwrap().len(), 2);
 }

@@ -1,6 +1,6 @@
 //! The page is self-contained, escapes all text and highlights the best values.
 
-use crate::common::command::says;
+use crate::common::says;
 use nightsplat_photographs::image::Image;
 use nightsplat_report::{
     Best, Chart, Column, Comparison, Distribution, Mark, NumberTable, Picture, Report, Series,

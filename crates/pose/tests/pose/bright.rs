@@ -1,31 +1,15 @@
-//! `nightsplat pose --with`: dark photographs posed through bright ones of the same scene.
+//! Dark photographs posed through bright ones of the same scene.
 
-use super::pose::{is_installed, mean, photographed, pose, stub};
-use super::synthetic::*;
-use crate::common::command::says;
-use crate::common::prelude::*;
+use std::fs;
 
-/// Bright photographs `day/v00.png` to `day/v03.png`: names of dark photographs, too.
-fn bright(root: &Path) -> PathBuf {
-    let day = root.join("day");
-    fs::create_dir_all(&day).unwrap();
-    for index in 0..4 {
-        let picture = Image::from_fn(SIZE.0, SIZE.1, |x, y| {
-            [0.3 + 0.5 * f32::from((x / 4 + y / 3 + index).is_multiple_of(2)); 3]
-        });
-        picture.save_png8(day.join(name(index as usize)).with_extension("png")).unwrap();
-    }
-    day
-}
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_pose::PoseOptions;
+use nightsplat_synth::SyntheticOptions;
 
-/// A model of the first eight dark photographs, three of which are called bright ones.
-fn mixed() -> Model {
-    let mut model = model(8);
-    for (_, _, _, name) in &mut model.images[..3] {
-        *name = format!("bright/v{:02}.png", name[1..3].parse::<usize>().unwrap() - 5);
-    }
-    model
-}
+use crate::common::{Folder, says};
+use crate::stub::{bright, is_installed, mean, mixed, photographed, stub};
+use crate::synthetic::{load, model, view};
+use crate::{estimated, pose, refused};
 
 #[test]
 fn the_dark_and_the_bright_photographs_get_a_dataset_each_in_the_same_coordinates() {
@@ -37,11 +21,12 @@ fn the_dark_and_the_bright_photographs_get_a_dataset_each_in_the_same_coordinate
     others.images.iter_mut().for_each(|(_, _, _, name)| *name = format!("bright/{name}"));
     others.write_binary(&root.join("models/1"));
     stub(root, "mapper) cp -r $root/models/* $output; cp -r $images $root/seen;;");
-    let (stdout, stderr) = root.run(&pose("--with @day"), 0);
-    says(&stdout, &["5 of 9 photographs and 3 of 4 bright ones"]);
+    let (posed, told) = estimated(&PoseOptions { with: Some(day.clone()), ..pose(root) });
+    let posed = posed.unwrap();
+    assert_eq!((posed.placed, posed.photographs, posed.bright), (5, 9, Some([3, 4])));
     let unplaced =
         "4 photographs have no camera and are left out: v05.png, v06.png, v07.png, v08.png";
-    says(&stderr, &["4 bright photographs beside them", unplaced]);
+    says(&told, &["4 bright photographs beside them", unplaced]);
     assert!(mean(&root.join("seen/v00.png")) > 4.0 * mean(&photos.join("v00.png")));
     let unchanged = mean(&root.join("seen/bright/v00.png")) / mean(&day.join("v00.png"));
     assert!((unchanged - 1.0).abs() < 0.01, "normal light stays as it is: {unchanged}");
@@ -65,17 +50,12 @@ fn the_dark_and_the_bright_photographs_get_a_dataset_each_in_the_same_coordinate
 }
 
 #[test]
-fn a_folder_that_cannot_pose_the_dark_photographs_is_refused() {
+fn bright_photographs_that_pose_no_dark_one_are_reported() {
     let root = &Folder::empty();
     photographed(root);
-    bright(root);
     stub(root, "mapper) exit 0;;");
-    let itself = ["photos", "is the folder of the dark photographs itself"];
-    root.refused(&pose("--with @photos"), 3, &itself);
-    root.refused(&pose("--with @none"), 3, &["none"]);
-    let sequential = pose("--with @day --matcher sequential");
-    root.refused(&sequential, 2, &["--matcher sequential", "take exhaustive"]);
-    says(&root.run(&pose("--with @day"), 3).1, &["found no cameras for these 9 photographs"]);
+    let options = PoseOptions { with: Some(bright(root)), ..pose(root) };
+    refused(&options, 3, &["found no cameras for these 9 photographs"]);
 }
 
 #[test]
@@ -84,7 +64,8 @@ fn colmap_poses_dark_photographs_through_bright_ones_of_other_views() {
         return;
     }
     let root = &Folder::empty();
-    let options = small_set(24, [200, 150], 3);
+    let options =
+        SyntheticOptions { views: 24, width: 200, height: 150, seed: 3, ..Default::default() };
     nightsplat_synth::write(root.join("set"), &options).unwrap();
     // Every sixth view is dark.
     for index in 0..options.views {
@@ -93,7 +74,13 @@ fn colmap_poses_dark_photographs_through_bright_ones_of_other_views() {
         let file = format!("{index:03}.png");
         fs::copy(root.join("set").join(from).join(&file), root.join(to).join(&file)).unwrap();
     }
-    root.succeed("pose @night --with @day --out @scene");
+    let options = PoseOptions {
+        photos: root.join("night"),
+        with: Some(root.join("day")),
+        colmap: "colmap".into(),
+        ..pose(root)
+    };
+    estimated(&options).0.unwrap();
     let (truth, dark, bright) =
         (load(&root.join("set")), load(&root.join("scene")), load(&root.join("scene/bright")));
     assert!(dark.views.len() >= 3 && bright.views.len() >= 15, "{} dark", dark.views.len());

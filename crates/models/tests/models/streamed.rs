@@ -1,16 +1,21 @@
 //! Streamed SOG: its index, its chunks, and what is refused.
 
+use std::fs;
 use std::io::{Cursor, Write as _};
+use std::path::Path;
 
-use nightsplat::splats::model::Model;
+use glam::DVec3;
+use nightsplat_core::Result;
+use nightsplat_core::random::Stream;
 use nightsplat_models::export::Provenance;
 use nightsplat_models::export::streamed::{self, Division, INDEX, TileLoader, Written};
+use nightsplat_models::files;
+use nightsplat_models::gaussians::Gaussians;
 use nightsplat_models::levels::level;
+use serde_json::Value;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
-use crate::common::command::json;
-use crate::common::prelude::*;
-use crate::common::{contents, paths};
+use crate::common::{Folder, contents, paths};
 
 /// Tiles of 300 and of 130 Gaussians side by side, each with an origin of its own.
 fn tiles() -> [Gaussians; 2] {
@@ -27,7 +32,7 @@ fn tiles() -> [Gaussians; 2] {
     })
 }
 
-fn written(folder: &Path, models: &[Gaussians], division: Division) -> nightsplat::Result<Written> {
+fn written(folder: &Path, models: &[Gaussians], division: Division) -> Result<Written> {
     let name = |index: usize| Path::new("model").join(index.to_string());
     let tiles: Vec<TileLoader<'_>> = models
         .iter()
@@ -38,7 +43,7 @@ fn written(folder: &Path, models: &[Gaussians], division: Division) -> nightspla
 }
 
 fn index(folder: &Path) -> Value {
-    json(fs::read(folder.join(INDEX)).unwrap())
+    serde_json::from_slice(&fs::read(folder.join(INDEX)).unwrap()).unwrap()
 }
 
 /// The Gaussians of a chunk, given by the path of its description.
@@ -51,7 +56,7 @@ fn chunk(folder: &Path, meta: &str) -> Gaussians {
     }
     let file = tempfile::NamedTempFile::new().unwrap();
     fs::write(file.path(), zip.finish().unwrap().into_inner()).unwrap();
-    Model::load(file.path()).unwrap().gaussians
+    files::read(file.path()).unwrap().0
 }
 
 fn corner(node: &Value, which: &str) -> DVec3 {
@@ -179,26 +184,4 @@ fn a_folder_with_anything_else_and_tiles_that_changed_are_refused_and_nothing_is
     assert!(!folder.path(INDEX).exists());
     let problem = written(&folder, &[Gaussians::zeros(0, 1)], division).unwrap_err();
     assert!(problem.to_string().contains("without Gaussians"), "{problem}");
-}
-
-#[test]
-fn the_command_writes_levels_and_refuses_options_of_other_formats() {
-    let folder = Folder::empty();
-    let [model, _] = tiles();
-    ply::save(&model, folder.path("a.ply")).unwrap();
-    let line = folder.succeed("export @a.ply --format streamed-sog --levels 2 --chunk 160");
-    says(&line, &["2 levels of 300, 152 Gaussians in 3 chunks"]);
-    assert_eq!(index(&folder.path("a.streamed-sog"))["counts"], serde_json::json!([300, 152]));
-
-    folder.succeed("export @a.ply --format ply --level 1 --chunk 160 --out @b.ply");
-    let half = ply::load(folder.path("b.ply")).unwrap();
-    assert_eq!(half, level(&model, &[model.count], 40, 1).with_sh_degree(3));
-    folder.refuses_all(
-        "2 | export @a.ply --format sog --levels 2 | --level
-         2 | export @a.ply --format streamed-sog --level 1 | --levels
-         2 | export @a.ply --format streamed-sog --levels 0 | --levels 0
-         2 | export @a.ply --format sog --level 16 | --level 16
-         2 | export @a.ply --format sog --chunk 0 | --chunk 0
-         2 | export @a.ply --format streamed-sog --out a.sog | --format sog",
-    );
 }

@@ -1,12 +1,19 @@
 //! Gaussians on the host: their table, their initialisation, their file.
 
-use glam::Quat;
+use std::fs;
+
+use glam::{DAffine3, DVec2, DVec3, Quat, Vec3};
+use nightsplat_core::Error;
+use nightsplat_core::camera::{Camera, CameraModel};
 use nightsplat_models::attributes::planes;
 use nightsplat_models::gaussians::init::Initialization;
-use nightsplat_models::gaussians::{ATTRIBUTES, SH_C0, init, rest_coefficients, width};
-use nightsplat_photographs::dataset::{Point, View};
+use nightsplat_models::gaussians::{
+    ATTRIBUTES, Features, Gaussians, SH_C0, Shape, init, ply, rest_coefficients, width,
+};
+use nightsplat_photographs::dataset::{Point, Split, View};
+use nightsplat_photographs::image::Image;
 
-use crate::common::prelude::*;
+use crate::common::{Folder, says};
 
 /// A camera at `position` that looks along +z.
 fn camera(position: DVec3) -> Camera {
@@ -338,7 +345,7 @@ mod colors {
     #[test]
     fn a_target_that_fails_is_reported() {
         let views = [view(Split::Train, DVec3::ZERO)];
-        let failing = |_| Err::<Option<Image>, _>(nightsplat::Error::Usage("no target".into()));
+        let failing = |_| Err::<Option<Image>, _>(Error::Usage("no target".into()));
         assert!(init::colors_from_views(&[], &views, |_, _| 1.0, failing).is_err());
     }
 }
@@ -493,14 +500,14 @@ mod ply_file {
 
     #[test]
     fn a_missing_folder_is_named_and_no_file_is_left() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = |name: &str| dir.path().join(name);
+        let dir = Folder::empty();
+        let path = |name: &str| dir.join(name);
         let problem = ply::save(&distinct(1, 0), path("missing/model.ply")).unwrap_err();
         assert!(problem.to_string().contains("missing"), "{problem}");
         let problem = ply::load(path("model.ply")).unwrap_err();
         assert!(problem.to_string().contains("model.ply"), "{problem}");
-        fs::create_dir(dir.path().join("taken")).unwrap();
-        assert!(ply::save(&distinct(1, 0), dir.path().join("taken")).is_err());
-        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1, "a temporary file is left");
+        fs::create_dir(path("taken")).unwrap();
+        assert!(ply::save(&distinct(1, 0), path("taken")).is_err());
+        assert_eq!(fs::read_dir(&dir).unwrap().count(), 1, "a temporary file is left");
     }
 }

@@ -1,9 +1,18 @@
-//! `nightsplat pose`: photographs that share a camera, photographs left out, and repeated runs of COLMAP.
+//! Photographs that share a camera, photographs left out, and what is burnt in.
 
-use super::pose::{MODELS, learned_stub, photographed, pose, stub};
-use super::synthetic::*;
-use crate::common::command::says;
-use crate::common::prelude::*;
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+
+use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::image::{Image, ImageFile as _};
+use nightsplat_pose::{PoseOptions, describe};
+use nightsplat_synth::SyntheticOptions;
+
+use crate::common::{Folder, paths, says};
+use crate::stub::{MODELS, is_installed, photographed, stub};
+use crate::synthetic::{Model, SIZE, load, model, photograph, view};
+use crate::{estimated, places, pose, refused};
 
 /// Copies a photograph and sets its equivalent focal length in Exif.
 fn taken_at(path: &Path, focal: u8) {
@@ -31,7 +40,8 @@ fn photographs_of_one_size_lens_and_focal_length_share_a_camera() {
     photograph(&photos.join("other.png"), SIZE, 0.05);
     photograph(&photos.join("another.png"), (32, 20), 0.05);
     stub(root, "feature_extractor) { tr '\\n' ' ' < $list; echo; } >> $root/lists;;");
-    says(&root.run(&pose(""), 3).1, &["3 groups of photographs by size, lens and focal length"]);
+    let told = refused(&pose(root), 3, &["no cameras for these 8 photographs"]);
+    says(&told, &["3 groups of photographs by size, lens and focal length"]);
     let lists = root.text("lists");
     let lists: BTreeSet<&str> = lists.lines().map(str::trim).collect();
     let expected = ["0.jpg 2.jpg 4.jpg", "1.jpg 3.jpg 5.jpg", "another.png other.png"];
@@ -47,10 +57,9 @@ fn a_photograph_that_does_not_decode_is_left_out_and_hidden_files_are_ignored() 
     photograph(&photos.join("dynamic_mask_v01.png"), SIZE, 1.0);
     model(9).write_binary(&root.join("models/0"));
     stub(root, MODELS);
-    let (stdout, stderr) = root.run(&pose(""), 0);
-    says(&stdout, &["9 of 9 photographs with their cameras, one calibrated"]);
-    says(&stderr, &["left out: ", "broken.jpg"]);
-    assert!(!stderr.contains("._v00"), "{stderr}");
+    let told = places(&pose(root), 9, 9);
+    says(&told, &["left out: ", "broken.jpg"]);
+    assert!(!told.contains("._v00"), "{told}");
     let dataset = load(&root.join("scene"));
     let masked: Vec<bool> = dataset.views.iter().map(|view| view.mask.is_some()).collect();
     // All of it is masked, so nothing is left to train on.
@@ -62,22 +71,25 @@ fn an_implausible_calibration_is_reported() {
     let root = &Folder::empty();
     photographed(root);
     stub(root, MODELS);
-    let posed = |fy: f64, code: i32| {
+    let set = |fy: f64| {
         let cameras = vec![(3, "PINHOLE", 1, vec![35.0, fy, 20.0, 15.0])];
         Model { cameras, ..model(9) }.write_binary(&root.join("models/0"));
-        root.run(&pose("--overwrite"), code)
     };
     for (fy, is_plausible) in [(36.0, true), (60.0, false)] {
-        let (stdout, stderr) = posed(fy, 0);
-        let warned = stderr.contains("is implausible: its focal lengths are 71 % apart");
-        assert_eq!(warned, !is_plausible, "{stderr}");
-        says(&stdout, &["40x30 with focal length 35"]);
+        set(fy);
+        let (posed, told) = estimated(&PoseOptions { overwrite: true, ..pose(root) });
+        let warned = told.contains("is implausible: its focal lengths are 71 % apart");
+        assert_eq!(warned, !is_plausible, "{told}");
+        let lenses: Vec<String> = posed.unwrap().lenses.iter().map(describe).collect();
+        assert!(
+            lenses.len() == 1 && lenses[0].contains("40x30 with focal length 35"),
+            "{lenses:?}"
+        );
     }
     fs::remove_dir_all(root.join("scene")).unwrap();
-    let (_, stderr) = posed(93.0, 3);
-    let error = stderr.lines().find(|line| line.starts_with("error: ")).unwrap();
+    set(93.0);
     let cannot_be = "photos: COLMAP's calibration cannot be, 40x30 with focal length 35 x 93";
-    says(error, &[cannot_be, "2.7 times", "--camera-model"]);
+    refused(&pose(root), 3, &[cannot_be, "2.7 times", "--camera-model"]);
     assert!(!root.join("scene").exists() && root.join("scene.colmap.log").is_file());
 }
 
@@ -92,10 +104,9 @@ fn a_camera_that_few_points_hold_is_left_out_and_said() {
     }
     model.write_binary(&root.join("models/0"));
     stub(root, MODELS);
-    let (stdout, stderr) = root.run(&pose(""), 0);
-    says(&stdout, &["8 of 9 photographs with their cameras"]);
+    let told = places(&pose(root), 8, 9);
     let left_out = "left out: v00.png (6); half of all photographs see 20";
-    assert!(stderr.contains(left_out) && !stderr.contains("have no camera"), "{stderr}");
+    assert!(told.contains(left_out) && !told.contains("have no camera"), "{told}");
     let dataset = load(&root.join("scene"));
     let names: BTreeSet<&str> = dataset.views.iter().map(|view| view.name.as_str()).collect();
     assert!(names.len() == 8 && !names.contains("v00"), "{names:?}");
@@ -120,7 +131,7 @@ fn what_is_burnt_in_has_no_features_and_is_masked_in_the_dataset() {
     photograph(&photos.join("masks/v04.png"), SIZE, 0.0);
     model(9).write_binary(&root.join("models/0"));
     stub(root, &format!("feature_extractor) cp -r $masks $root/seen;;\n{MODELS}"));
-    says(&root.run(&pose(""), 0).1, &[" % of the photographs of 40x30 hardly changes"]);
+    says(&places(&pose(root), 9, 9), &[" % of the photographs of 40x30 hardly changes"]);
     let shown =
         |mask: &Path, x: u32, y: u32| Image::load(mask).unwrap().data[(40 * y + x) as usize] > 0.0;
     for mask in [seen.join("v03.png.png"), seen.join("v08.png.png"), out.join("masks/v08.png")] {
@@ -165,7 +176,7 @@ fn a_dim_dashboard_has_no_features() {
     }
     model(9).write_binary(&root.join("models/0"));
     stub(root, &format!("feature_extractor) cp -r $masks $root/seen;;\n{MODELS}"));
-    says(&root.run(&pose(""), 0).1, &["hardly changes between views that move"]);
+    says(&places(&pose(root), 9, 9), &["hardly changes between views that move"]);
     let mask = Image::load(seen.join("v08.png.png")).unwrap();
     let pixels = || (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
     let is_shown = |x: u32, y: u32| mask.data[(width * y + x) as usize] > 0.0;
@@ -173,104 +184,46 @@ fn a_dim_dashboard_has_no_features() {
     assert!(pixels().all(|(x, y)| y >= 168 || is_shown(x, y)), "the scene");
 }
 
-#[test]
-fn few_photographs_start_from_a_closer_pair_and_options_go_to_their_command() {
-    let root = &Folder::empty();
-    photographed(root);
-    model(9).write_binary(&root.join("models/0"));
-    let for_angle = |angle: u32| {
-        let copy = "cp -r $root/models/* $output";
-        stub(root, &format!("mapper) [ \"$angle\" = {angle} ] && {copy}; exit 0;;"));
-    };
-    for_angle(2);
-    let (stdout, stderr) = root.run(&pose(""), 0);
-    says(&stdout, &["9 of 9 photographs"]);
-    assert_eq!(stderr.matches("registering again, from a closer pair").count(), 2, "{stderr}");
-    let relaxed = "--Mapper.init_max_forward_motion 1 --Mapper.init_min_num_inliers 50";
-    says(&root.text("scene/colmap.log"), &[relaxed]);
-
-    // The user's value is the only one.
-    for_angle(3);
-    let asked = |option: &str| pose(&format!("--overwrite --colmap-option {option}"));
-    root.succeed(&asked("Mapper.init_min_tri_angle=3"));
-    let log = root.text("scene/colmap.log");
-    assert_eq!(log.matches("init_min_tri_angle").count(), 1, "{log}");
-    let none_has = "none of feature_extractor, exhaustive_matcher, mapper has";
-    root.refused(&asked("Mapper.nothing=3"), 2, &["Mapper.nothing", none_has]);
-    let valueless = ["Mapper.init_min_tri_angle", "is not NAME=VALUE"];
-    root.refused(&asked("Mapper.init_min_tri_angle"), 2, &valueless);
-}
-
-#[test]
-fn learned_features_are_tried_where_most_photographs_have_no_camera() {
-    let root = &Folder::empty();
-    photographed(root);
-    model(4).write_binary(&root.join("some/0"));
-    model(9).write_binary(&root.join("all/0"));
-    learned_stub(
-        root,
-        "mapper) case $database in */learned-*) cp -r $root/all/* $output;; *) cp -r $root/some/* $output;; esac;;",
-    );
-    let (stdout, stderr) = root.run(&pose(""), 0);
-    says(&stdout, &["9 of 9 photographs"]);
-    let plan = "SIFT features; if most photographs have no camera, learned ones too";
-    says(&stderr, &[plan, "4 of 9 have a camera: learned features, for at most 2 min"]);
-    assert!(!stderr.contains("matching again"), "{stderr}");
-    let log = root.text("scene/colmap.log");
-    for option in
-        ["--FeatureExtraction.type ALIKED_N16ROT", "--FeatureMatching.type ALIKED_LIGHTGLUE"]
-    {
-        assert_eq!(log.matches(option).count(), 1, "{option}: {log}");
+/// Burns a line of text into the last rows of photographs of 200x150; its end changes.
+fn burn_in_text(folder: &Path) {
+    for (index, file) in paths(folder).iter().enumerate() {
+        let mut picture = Image::load(file).unwrap();
+        let (width, pixels) = (picture.width as usize, picture.pixel_count());
+        for pixel in 138 * width..pixels {
+            let (column, row) = (pixel % width / 4, (pixel / width - 138) / 3);
+            let changes = if column >= 40 { 5 * index } else { 0 };
+            let is_lit = (7 * column + 13 * row + changes + column * row % 5) % 11 < 4;
+            let value = f32::from(u8::from(is_lit && row < 3 && column < 48));
+            (0..3).for_each(|channel| picture.data[channel * pixels + pixel] = value);
+        }
+        picture.save_png8(file).unwrap();
     }
-
-    // On request, they are the first and only ones.
-    let (_, stderr) = root.run(&pose("--overwrite --features learned"), 0);
-    says(&stderr, &["learned features: ALIKED, matched by LightGlue"]);
-    let log = root.text("scene/colmap.log");
-    assert_eq!((log.matches("$ ").count(), log.matches("ALIKED_N16ROT").count()), (3, 1), "{log}");
-    // With SIFT asked for, none are tried.
-    let (_, stderr) = root.run(&pose("--overwrite --features sift --patience 0.1"), 0);
-    assert!(!stderr.contains("learned"), "{stderr}");
 }
 
 #[test]
-fn a_colmap_without_learned_features_or_their_networks_is_told_with_the_remedy() {
-    let root = &Folder::empty();
-    photographed(root);
-    let ask = pose("--features learned");
-    stub(root, MODELS);
-    let without = "--features learned: this COLMAP has no ALIKED features";
-    root.refused(&ask, 2, &[without, "--colmap PATH", "--features sift"]);
-    assert!(!root.join("scene").exists());
-    let onnx = "ALIKED feature extraction requires ONNX support.";
-    for (printed, parts) in [
-        (onnx, ["built without ONNX", "--features sift"]),
-        ("Check failed: Failed to download file", ["could not fetch", "n16rot_model_path=FILE"]),
-    ] {
-        learned_stub(root, &format!("feature_extractor) echo '{printed}' >&2; exit 1;;"));
-        let (_, stderr) = root.run(&ask, 2);
-        says(stderr.lines().last().unwrap(), &parts);
+fn colmap_finds_the_cameras_of_a_dark_set_with_a_date_burnt_into_it() {
+    if !is_installed("colmap") {
+        return;
     }
-    // What is tried without being asked for is a warning, and SIFT goes on.
-    model(4).write_binary(&root.join("some/0"));
-    model(9).write_binary(&root.join("all/0"));
-    learned_stub(
-        root,
-        "feature_extractor) case $database in */learned-*) echo 'requires ONNX support' >&2; exit 1;; esac;;\n\
-         mapper) case $database in */guided.db) cp -r $root/all/* $output;; *) cp -r $root/some/* $output;; esac;;",
-    );
-    let (stdout, stderr) = root.run(&pose(""), 0);
-    says(&stdout, &["9 of 9 photographs"]);
-    let told = ["built without ONNX", "going on with SIFT", "4 of 9 have a camera: matching again"];
-    says(&stderr, &told);
-}
-
-#[test]
-fn an_archive_of_photographs_is_read_in_place() {
     let root = &Folder::empty();
-    pack(&photographed(root), &root.join("photos.zip"), "scan/");
-    model(9).write_binary(&root.join("models/0"));
-    stub(root, MODELS);
-    says(&root.succeed(&pose("").replace("@photos", "@photos.zip")), &["9 of 9 photographs"]);
-    assert_eq!(load(&root.join("scene")).views.len(), 9);
+    let options =
+        SyntheticOptions { views: 20, width: 200, height: 150, seed: 3, ..Default::default() };
+    nightsplat_synth::write(root.join("set"), &options).unwrap();
+    burn_in_text(&root.join("set/low"));
+    let options =
+        PoseOptions { photos: root.join("set/low"), colmap: "colmap".into(), ..pose(root) };
+    estimated(&options).0.unwrap();
+    let (truth, found) = (load(&root.join("set")), load(&root.join("scene")));
+    assert!(found.views.len() >= 15, "{} of 20", found.views.len());
+    assert!(found.points.len() > 50, "{} points", found.points.len());
+    // Distances between cameras, whose scale is free.
+    let center = |name: &str, set: &Dataset| view(set, name).camera.center();
+    let names: Vec<&str> = found.views.iter().map(|view| view.name.as_str()).collect();
+    let spans = names.windows(3).map(|three| {
+        let span = |set| center(three[0], set).distance(center(three[2], set));
+        span(&found) / span(&truth)
+    });
+    let spans: Vec<f64> = spans.collect();
+    let mean = spans.iter().sum::<f64>() / spans.len() as f64;
+    assert!(spans.iter().all(|span| (span / mean - 1.0).abs() < 0.1), "{spans:?}");
 }
