@@ -20,7 +20,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         steps: steps + REPEATS,
         ..TrainConfig::bare()
     };
-    config.schedule.resolution_steps = [0, 0];
+    config.schedule.resolution_steps = Some([0, 0]);
     let gpu = Gpu::new(&DeviceChoice::Best)?;
     let dataset = Dataset::load(path, &config.load_options())?;
     let mut trainer = Trainer::new(&gpu, config, &dataset)?;

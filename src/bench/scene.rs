@@ -152,7 +152,7 @@ fn config(precision: &PrecisionConfig) -> TrainConfig {
     config.schedule.sh_degree_interval = 1;
     config.schedule.initial_rate_factor = 1.0;
     config.schedule.densify_after = i64::MAX as u64;
-    config.schedule.resolution_steps = [0, 0];
+    config.schedule.resolution_steps = Some([0, 0]);
     config
 }
 

@@ -31,7 +31,7 @@ pub(crate) fn speed(gpu: &Gpu, planned: &PlannedRun) -> Result<(f64, usize)> {
     let mut config = planned.config.clone();
     config.steps = STEPS.iter().sum();
     config.stop.views = 0;
-    config.schedule.resolution_steps = [0, 0];
+    config.schedule.resolution_steps = Some([0, 0]);
     let mut trainer = Trainer::new(gpu, config, &dataset)?;
     while trainer.steps_done() < STEPS[0] {
         trainer.advance(STEPS[0])?;

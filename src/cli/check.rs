@@ -34,7 +34,7 @@ pub fn run(args: &CheckArgs) -> Result<()> {
     let steps = if args.options.gives("steps") { steps } else { 1 };
     let mut config = args.options.without("steps").config(&args.dataset, None)?;
     // Full resolution from the first step on.
-    config.schedule.resolution_steps = [0, 0];
+    config.schedule.resolution_steps = Some([0, 0]);
     let steps = steps.min(config.steps);
     let gpu = driver::open(&config.device.parse::<DeviceChoice>()?)?;
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;

@@ -169,7 +169,7 @@ impl RunClock {
 
     /// Scores since views have their full size.
     pub(super) fn whole_scores(&self) -> impl Iterator<Item = HeldOutScore> {
-        let [_, whole] = self.config.schedule.resolution_steps;
+        let [_, whole] = self.config.resolution_steps();
         self.decisions.scores.iter().filter(move |score| score.step >= whole).copied()
     }
 

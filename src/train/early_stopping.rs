@@ -90,7 +90,7 @@ mod tests {
         nightsplat_synth::write(folder.path(), &options).unwrap();
         let mut config = TrainConfig { steps: 20, ..TrainConfig::bare() };
         (config.stop.views, config.stop.margin) = (1, margin);
-        config.schedule.resolution_steps = [0, 0];
+        config.schedule.resolution_steps = Some([0, 0]);
         let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
         let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
         train_until(&mut trainer, 12);

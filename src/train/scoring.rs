@@ -51,7 +51,7 @@ impl Trainer {
             detail as f64 / 1e6
         );
         let is_best = self.clock.best_score().is_none_or(|best| score.score > best.score);
-        let [_, whole] = self.config.schedule.resolution_steps;
+        let [_, whole] = self.config.resolution_steps();
         if is_best && step >= whole {
             self.model.best = self.snapshot()?;
         }
@@ -71,7 +71,7 @@ impl Trainer {
     /// The limit of Gaussians from the held-out views, decided before every round of density control.
     pub(super) fn growth_limit(&mut self) -> Result<usize> {
         let (growth_gain, step) = (self.config.stop.growth_gain, self.clock.step);
-        let [_, whole] = self.config.schedule.resolution_steps;
+        let [_, whole] = self.config.resolution_steps();
         let gaussians = self.model.count();
         // A score taken before memory ran out is not taken again.
         let is_scored = self.clock.decisions.rounds.last().is_some_and(|round| round.step == step);

@@ -165,6 +165,7 @@ mod tests {
             "falloff=1",
             "bands={}",
             "schedule.first_sh_degree=1",
+            "schedule.resolution_steps=[0,1]",
             "density.gradient_threshold=0.001",
         ];
         set.extend(rest.map(str::to_owned));

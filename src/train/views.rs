@@ -93,7 +93,7 @@ impl Views {
         let budget = CacheSize::on_device(config.cache, config.max_vram, gpu);
         let mut cache = Cache::new(gpu, budget, config.spool.clone());
         let mut levels = vec![];
-        levels.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
+        levels.resize_with(config.resolution_levels(), Vec::<TrainView>::new);
         let mut curves = vec![];
         let stage = Stage::begin("uploading photographs", photographs(dataset).count());
         for (at, (index, view)) in photographs(dataset).enumerate() {
@@ -298,7 +298,7 @@ impl Views {
     /// The view of a step: every epoch takes each view once, in its own order; the view after one that is left out is
     /// taken twice.
     pub(super) fn at_step(&self, config: &TrainConfig, step: u64) -> TrainingView {
-        let range = self.levels[config.schedule.resolution_level(step)].clone();
+        let range = self.levels[config.resolution_level(step)].clone();
         let (order, first) = self.epochs.of_step(config.seed, step, range.len());
         let views = &self.all[range];
         let in_turn = order[first..].iter().chain(&order[..first]);

@@ -33,7 +33,7 @@ fn config() -> TrainConfig {
     config.schedule.densify_after = 2;
     config.schedule.densify_interval = 4;
     config.schedule.sh_degree_interval = 5;
-    config.schedule.resolution_steps = [0, 0];
+    config.schedule.resolution_steps = Some([0, 0]);
     config.density.gradient_threshold = Some(1e-7);
     config
 }
@@ -161,7 +161,7 @@ fn growing() -> TrainConfig {
     config.schedule.densify_after = 2;
     config.schedule.densify_interval = 10;
     config.schedule.sh_degree_interval = 20;
-    config.schedule.resolution_steps = [0, 0];
+    config.schedule.resolution_steps = Some([0, 0]);
     config.density.control = DensityControl::Paper;
     config.density.gradient_threshold = Some(1e-9);
     config.density.min_opacity = 1e-4;

@@ -18,7 +18,7 @@ fn varied() -> (Folder, TrainConfig, Dataset) {
     tone.scene_statistics = true;
     let mut config = TrainConfig { steps: 300, sh_degree: 0, tone, ..TrainConfig::bare() };
     config.schedule.densify_before = 0;
-    config.schedule.resolution_steps = [0, 40];
+    config.schedule.resolution_steps = Some([0, 40]);
     config.exposure.learn = true;
     let folder = written(&small_set(14, [40, 30], 3));
     let mut dataset = Dataset::load(&folder, &config.load_options()).unwrap();

@@ -20,7 +20,7 @@ fn bad_gradient() -> Defect {
 fn config(not_finite: NotFinite) -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::Ap3);
     let mut config = TrainConfig { steps: 60, ssim_weight: 0.0, tone, ..TrainConfig::bare() };
-    config.schedule.resolution_steps = [0, 0];
+    config.schedule.resolution_steps = Some([0, 0]);
     config.schedule.densify_after = u64::MAX / 2;
     config.stop.not_finite = not_finite;
     config

@@ -155,7 +155,7 @@ fn every_part_of_the_model_trains_on_patches_and_two_runs_have_the_same_bits() {
         view.depth = Some((0..width * height).map(|i| (i / width) as f32 / 48.0).collect());
     }
     let mut config = TrainConfig { steps: 12, ..config(Some(800)) };
-    config.schedule.resolution_steps = [0, 5];
+    config.schedule.resolution_steps = Some([0, 5]);
     let mut exposed = config.clone();
     exposed.exposure.learn = true;
     config.model.set_parts(&Part::ALL);
@@ -284,7 +284,7 @@ fn training_uses_patches_whose_intersections_the_device_can_process() {
     let gaussians = setup.gaussians();
     let mut config = TrainConfig { steps: 8, sh_degree: 0, ..config(None) };
     config.frame = Some(TrainingFrame::WORLD);
-    config.schedule.resolution_steps = [0, 0];
+    config.schedule.resolution_steps = Some([0, 0]);
     let mut trainer = Trainer::from_gaussians(&gpu(), config, &dataset, &gaussians).unwrap();
     // Four quarters of each view, with room for twice the intersections.
     let reports = advance(&mut trainer, 8);

@@ -41,7 +41,7 @@ fn photographs_in_the_fewest_exact_bits_train_to_the_same_bits_in_less_memory() 
     ] {
         let run = |bits| {
             let mut config = config(tone.clone(), bits);
-            config.schedule.resolution_steps = [0, 2];
+            config.schedule.resolution_steps = Some([0, 2]);
             config.model.denoiser = parts && tone.curve == ToneCurve::Ase;
             config.model.structure = parts;
             train(&config, &dataset)

@@ -79,7 +79,7 @@ fn growth_and_the_sh_degree_stop_if_held_out_views_gain_too_little_and_stay_so_a
     let gpu = gpu();
     let mut free = config(&[]);
     free.schedule.densify_interval = 3;
-    free.schedule.resolution_steps = [0, 0];
+    free.schedule.resolution_steps = Some([0, 0]);
     free.stop.views = 1;
     let mut ending = free.clone();
     (ending.stop.growth_gain, ending.stop.degree_gain) = (1e3, 1e3);
@@ -107,7 +107,7 @@ fn early() -> (Folder, Dataset, TrainConfig) {
     let folder = written(&small_set(12, [40, 30], 2));
     let mut config = config(&[]);
     config.steps = 60;
-    config.schedule.resolution_steps = [0, 0];
+    config.schedule.resolution_steps = Some([0, 0]);
     (config.stop.views, config.stop.every, config.stop.gain) = (1, 7, 90.0);
     config.stop.detail_gain = 1.0;
     config.schedule.cooldown_steps = 9;

@@ -104,7 +104,7 @@ fn coarse_steps_come_first_and_repeat_bit_for_bit() {
     let dataset = crate::common::train::dataset(6, [128, 128]);
     let mut config = TrainConfig { steps: 30, ..config() };
     let (_, full) = train(&config, &dataset);
-    config.schedule.resolution_steps = [8, 20];
+    config.schedule.resolution_steps = Some([8, 20]);
     let (reports, coarse) = train(&config, &dataset);
     assert_eq!(coarse, train(&config, &dataset).1);
     assert_ne!(coarse.parameters, full.parameters);

@@ -11,7 +11,7 @@ fn config() -> TrainConfig {
     let mut config = TrainConfig { steps: 150, ..TrainConfig::bare() };
     config.schedule.densify_after = 10;
     config.schedule.densify_interval = 40;
-    config.schedule.resolution_steps = [0, 40];
+    config.schedule.resolution_steps = Some([0, 40]);
     config
 }
 

@@ -51,7 +51,7 @@ impl DensityControl {
                 name: "conserving",
                 keeps_views: true,
                 adds_pixels: true,
-                gradient_threshold: 1.6e-3,
+                gradient_threshold: 1.2e-3,
                 spreads_growth: true,
                 seeds_depths: true,
             },

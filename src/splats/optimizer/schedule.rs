@@ -101,7 +101,8 @@ pub struct Schedule {
     /// The factor on the learning rates at the end of the cooldown.
     cooldown_rate: f64 = 0.05 => Rule::above(0.0, 1.0);
     /// Views have a quarter of their width and height before the first of these steps, half before the second.
-    resolution_steps: [u64; 2] = [0, 200] => Rule::List(2, 2, &Rule::COUNT), in "steps";
+    resolution_steps: Option<[u64; 2]> = None, "0, and a fifth of the steps, at most 1000"
+        => Rule::List(2, 2, &Rule::COUNT), in "steps";
     /// The weight of the near-camera damping is 1 before the first of these steps, 1/2 before the second, then 0.
     damping_steps: [u64; 2] = [4_000, 7_000] => Rule::List(2, 2, &Rule::COUNT), in "steps";
 }
@@ -150,7 +151,7 @@ impl Schedule {
             densify_after: 500,
             densify_before: 5_000,
             densify_interval: 200,
-            resolution_steps: [0, 0],
+            resolution_steps: Some([0, 0]),
             cooldown_steps: 0,
             ..Self::default()
         }
@@ -204,7 +205,7 @@ impl Schedule {
             densify_before: left(self.densify_before),
             densify_interval: scaled(self.densify_interval).max(1),
             cooldown_steps: scaled(self.cooldown_steps),
-            resolution_steps: self.resolution_steps.map(left),
+            resolution_steps: Some(self.resolution_steps.unwrap_or_default().map(left)),
             damping_steps: self.damping_steps.map(left),
             initial_rates: initial_rates.scaled(by),
             ..self.clone()
@@ -235,20 +236,6 @@ impl Schedule {
     /// The factor on the learning rates after this fraction of the cooldown.
     pub(crate) fn cooldown_factor(&self, done: f64) -> f64 {
         self.cooldown_rate.powf(done.clamp(0.0, 1.0))
-    }
-
-    /// How often the views of `step` are halved.
-    pub(crate) fn resolution_level(&self, step: u64) -> usize {
-        match self.resolution_steps {
-            [quarter, _] if step < quarter => 2,
-            [_, half] if step < half => 1,
-            _ => 0,
-        }
-    }
-
-    /// The number of resolution levels.
-    pub(crate) fn resolution_levels(&self) -> usize {
-        1 + self.resolution_level(1)
     }
 
     /// The number of rounds of density control from the end of `step` on, that one included, up to step `last`.
@@ -297,7 +284,7 @@ mod tests {
                 }
             }
             assert_eq!(rest.sh_degree(0, 3), whole.sh_degree(step, 3));
-            assert_eq!(rest.resolution_levels(), 1);
+            assert_eq!(rest.resolution_steps, Some([0, 0]));
         }
         assert_eq!(whole.after_step(1_000, 0.1).densify_interval, 10);
         assert_eq!(whole.after_step(1_000, 0.1).densify_before, 200);
@@ -351,13 +338,6 @@ mod tests {
                 Schedule::paper().learning_rates(step, 1.0)
             );
         }
-    }
-
-    #[test]
-    fn views_grow_to_their_size() {
-        let schedule = Schedule { resolution_steps: [10, 20], ..Schedule::paper() };
-        assert_eq!([1, 9, 10, 19, 20].map(|step| schedule.resolution_level(step)), [2, 2, 1, 1, 0]);
-        assert_eq!((schedule.resolution_levels(), Schedule::paper().resolution_levels()), (3, 1));
     }
 
     #[test]
