@@ -65,13 +65,12 @@ compile() {
     local train=(train "$work/set" --out "$work/run" --overwrite --plan none --steps 2 --sh-degree 3)
     run "$1" "$nightsplat" "${train[@]}" --model plain --exposure on --set loss.opacity_weight=0.01 || return
     run "$1" "$nightsplat" "${train[@]}" --model plain --parts lamp,normals || return
+    # The width of the presets, and the paper's.
     case $1 in
-        navi31 | gfx1201) ;;
-        *) return 0 ;;
+        navi31 | gfx1201)
+            run "$1" "$nightsplat" "${train[@]}" --model lita --denoiser-precision half &&
+                run "$1" "$nightsplat" "${train[@]}" --model lita --denoiser-precision half --denoiser-channels 64 ;;
     esac
-    # As the presets have it, and as the paper does.
-    run "$1" "$nightsplat" "${train[@]}" --model lita --denoiser-precision half || return
-    run "$1" "$nightsplat" "${train[@]}" --model lita --denoiser-precision half --denoiser-channels 64
 }
 
 # The kernels of another device with 64 lanes, by Turnip, whose drivers are for another processor.

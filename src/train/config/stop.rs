@@ -4,8 +4,6 @@ use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
 use serde::{Deserialize, Serialize};
 
-use super::TrainConfig;
-
 settings! {
 "stop."
 /// Early stopping of a run or of a part of it. Scores are against targets, never against references.
@@ -72,12 +70,5 @@ impl StopConfig {
         ];
         let changed = settings.into_iter().find(|(_, before, now)| before != now);
         changed.map(|(name, before, now)| format!("stop.{name} was {before} and is {now}"))
-    }
-}
-
-impl TrainConfig {
-    /// The number of cooldown steps: the schedule's, or a third of a short run.
-    pub(crate) fn effective_cooldown_steps(&self) -> u64 {
-        self.schedule.cooldown_steps.min(self.steps / 3)
     }
 }
