@@ -206,27 +206,27 @@ pub use splats::render::{
 
 // Photographs and training.
 #[cfg(feature = "train")]
-#[doc(inline)]
-pub use nightsplat_models::{
-    export::{Format, spz::Version as SpzVersion},
-    gaussians::init::Initialization,
-};
-#[cfg(feature = "train")]
-#[doc(inline)]
-pub use nightsplat_photographs::{
-    dataset::{
-        Dataset, DepthOptions, LoadOptions, NormalAxes, NormalMap, NormalOptions, Original, Point,
-        RowBands, Split, View,
-    },
-    image::{ImageFile, Mask, Orientation},
-    metrics::Scores,
-    tone::{Expression, Profile, Table, Tone, ToneCurve, ToneSettings},
-    white_balance::WhiteBalance,
-};
-#[cfg(feature = "train")]
 pub use {
     loss::Term,
     train::{Ended, MemoryEstimate, Part, Preset, Rendered, StepReport, TrainConfig, Trainer},
+};
+#[cfg(feature = "train")]
+#[doc(inline)]
+pub use {
+    nightsplat_models::{
+        export::{Format, spz::Version as SpzVersion},
+        gaussians::init::Initialization,
+    },
+    nightsplat_photographs::{
+        dataset::{
+            Dataset, DepthOptions, LoadOptions, NormalAxes, NormalMap, NormalOptions, Original,
+            Point, RowBands, Split, View,
+        },
+        image::{ImageFile, Mask, Orientation},
+        metrics::Scores,
+        tone::{Expression, Profile, Table, Tone, ToneCurve, ToneSettings},
+        white_balance::WhiteBalance,
+    },
 };
 
 /// The sections of a [`TrainConfig`].

@@ -21,6 +21,9 @@ mod orientation;
 mod png_file;
 #[cfg(feature = "raw")]
 mod raw;
+#[cfg(not(feature = "raw"))]
+#[path = "image/unread_raw.rs"]
+mod raw;
 mod rows;
 mod source;
 

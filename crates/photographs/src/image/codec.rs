@@ -13,13 +13,11 @@ use nightsplat_core::output::write_whole;
 use nightsplat_core::{Error, Result};
 
 use super::colour::ColourCounts;
-#[cfg(not(feature = "raw"))]
-use super::decode::no_raw;
 use super::decode::{PictureFile, decode};
 use super::decoded::{DecodedImage, Meaning};
 use super::files::{READS_RAW, is_raw};
 use super::levels::Levels;
-use super::{Image, Orientation, declared, exr_file, jpeg, linear_from_srgb, png_file};
+use super::{Image, Orientation, declared, exr_file, jpeg, linear_from_srgb, png_file, raw};
 use crate::tree;
 
 /// The bytes by which a file is told from others.
@@ -74,7 +72,7 @@ impl PictureFile {
     /// Width and height, from its header alone.
     pub fn size(&self) -> Result<(u32, u32)> {
         if is_raw(&self.path) {
-            return raw_size(&self.path, self.bytes.clone());
+            return raw::size_of(&self.path, self.bytes.clone());
         }
         declared::size(&self.path, Cursor::new(self.bytes.as_slice()))
     }
@@ -249,7 +247,7 @@ impl ImageFile for Image {
     fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
         let path = path.as_ref();
         if is_raw(path) {
-            return raw_size(path, tree::bytes(path)?);
+            return raw::size_of(path, tree::bytes(path)?);
         }
         #[cfg(debug_assertions)]
         openings::count(path);
@@ -318,12 +316,4 @@ fn to_png(image: &Image, path: &Path, bytes: &[u8], color: ExtendedColorType) ->
         .write_image(bytes, image.width, image.height, color)
         .map_err(|error| Error::output(path, format!("cannot be encoded: {error}")))?;
     Ok(file)
-}
-
-#[cfg(feature = "raw")]
-use super::raw::size_of as raw_size;
-
-#[cfg(not(feature = "raw"))]
-fn raw_size(path: &Path, _: Vec<u8>) -> Result<(u32, u32)> {
-    Err(no_raw(path))
 }

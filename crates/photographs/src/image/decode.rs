@@ -9,13 +9,11 @@ use nightsplat_core::{Error, Result};
 use super::budget::{self, Permit};
 use super::colour::{self, Conversion, Converter};
 use super::decoded::{DecodedImage, Meaning};
-#[cfg(not(feature = "raw"))]
-use super::files::RAW_REMEDY;
 use super::files::{CONVERTIBLE, is_raw};
 use super::levels::{Levels, SampleFormat};
 use super::rows::{Destination, RowObserver, Rows};
 use super::source::{reader, undecodable};
-use super::{Image, declared, exr_file, jpeg, png_file};
+use super::{Image, declared, exr_file, jpeg, png_file, raw};
 
 /// An image file, read whole.
 #[derive(Clone, Debug)]
@@ -48,7 +46,7 @@ pub(super) fn decode(file: PictureFile, meaning: Meaning, levels: &Levels) -> Re
     }
     let format = rows_format(path, &bytes)?;
     if format == RowsFormat::Raw {
-        return Ok(DecodedImage::as_stored(load_raw(path, bytes)?, None).resized_to(at));
+        return Ok(DecodedImage::as_stored(raw::load(path, bytes)?, None).resized_to(at));
     }
     let is_colour = meaning == Meaning::Colour;
     let converts = is_colour && !levels.are_linear();
@@ -182,20 +180,6 @@ fn refuse_convertible(path: &Path, bytes: &[u8]) -> Result<()> {
     };
     let remedy = CONVERTIBLE.iter().find(|(name, ..)| *name == kind).map(|(.., remedy)| remedy);
     Err(Error::input(path, format!("is {kind}; {}", remedy.unwrap_or(&"convert it first"))))
-}
-
-#[cfg(feature = "raw")]
-use super::raw::load as load_raw;
-
-/// The error for camera RAW where it is not read.
-#[cfg(not(feature = "raw"))]
-pub(super) fn no_raw(path: &Path) -> Error {
-    Error::input(path, format!("is camera RAW, which this build does not read; {RAW_REMEDY}"))
-}
-
-#[cfg(not(feature = "raw"))]
-fn load_raw(path: &Path, _: Vec<u8>) -> Result<Image> {
-    Err(no_raw(path))
 }
 
 impl PictureFile {

@@ -3,8 +3,6 @@
 mod as_it_is;
 mod bad_input;
 mod colours;
-#[cfg(feature = "raw")]
-mod dng;
 mod keys;
 mod layouts;
 mod levels;

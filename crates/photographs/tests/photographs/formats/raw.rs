@@ -4,8 +4,11 @@ use std::fs;
 
 use nightsplat_photographs::image::{Image, ImageFile as _, linear_from_srgb, srgb_from_linear};
 
-use super::dng::{counted, dng};
+use self::dng::{counted, dng};
 use crate::common::Folder;
+
+#[path = "dng.rs"]
+mod dng;
 
 #[test]
 fn a_linear_dng_is_linear_light_with_the_cameras_white() {
