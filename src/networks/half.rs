@@ -87,7 +87,6 @@ impl HalfConv {
             let accumulate = adds == target;
             gpu.pipeline(&conv3x3_half::Constants { m, n, k, blocks, biased, accumulate })
         };
-        let rows = HALF_STRIP_ROWS;
         Ok(Self {
             channels,
             matrix,
@@ -103,7 +102,7 @@ impl HalfConv {
                 m,
                 n,
                 k,
-                rows,
+                rows: HALF_STRIP_ROWS,
             })?,
             reduce: Reduce::new(gpu)?,
         })

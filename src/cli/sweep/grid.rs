@@ -29,8 +29,8 @@ pub(super) enum Grid {
 const CHANGES: [(&str, &[&str]); 8] = [
     ("steps", &["500", "1000"]),
     ("stop.gain", &["0.02", "0.1"]),
-    // Steps at a quarter and at half resolution; `balanced` has 0 and 200.
-    ("schedule.resolution_steps", &["[0,0]", "[0,1000]"]),
+    // Steps at a quarter and at half resolution; `balanced` has 0 and 1 000.
+    ("schedule.resolution_steps", &["[0,0]", "[0,2000]"]),
     ("schedule.initial_rate_factor", &["1"]),
     ("max_gaussians", &["2000", "4000"]),
     ("sh_degree", &["0", "1"]),
@@ -42,7 +42,7 @@ const CHANGES: [(&str, &[&str]); 8] = [
 const FIXED: [(&str, &str); 3] = [
     (
         "downscale",
-        "changes the scored images; --grid schedule.resolution_steps=[0,1000] trains at lower resolution only",
+        "changes the scored images; --grid schedule.resolution_steps=[0,2000] trains at lower resolution only",
     ),
     ("dataset", "is common to all points"),
     ("reference", "is what scores compare with"),

@@ -12,7 +12,7 @@ use nightsplat_synth::SyntheticOptions;
 use crate::common::{Folder, paths, says};
 use crate::stub::{MODELS, is_installed, photographed, stub};
 use crate::synthetic::{Model, SIZE, load, model, photograph, view};
-use crate::{estimated, places, pose, refused};
+use crate::{estimated, finds_cameras, pose, refused};
 
 /// Copies a photograph and sets its equivalent focal length in Exif.
 fn taken_at(path: &Path, focal: u8) {
@@ -57,7 +57,7 @@ fn a_photograph_that_does_not_decode_is_left_out_and_hidden_files_are_ignored() 
     photograph(&photos.join("dynamic_mask_v01.png"), SIZE, 1.0);
     model(9).write_binary(&root.join("models/0"));
     stub(root, MODELS);
-    let told = places(&pose(root), 9, 9);
+    let told = finds_cameras(&pose(root), 9, 9);
     says(&told, &["left out: ", "broken.jpg"]);
     assert!(!told.contains("._v00"), "{told}");
     let dataset = load(&root.join("scene"));
@@ -104,7 +104,7 @@ fn a_camera_that_few_points_hold_is_left_out_and_said() {
     }
     model.write_binary(&root.join("models/0"));
     stub(root, MODELS);
-    let told = places(&pose(root), 8, 9);
+    let told = finds_cameras(&pose(root), 8, 9);
     let left_out = "left out: v00.png (6); half of all photographs see 20";
     assert!(told.contains(left_out) && !told.contains("have no camera"), "{told}");
     let dataset = load(&root.join("scene"));
@@ -131,7 +131,7 @@ fn what_is_burnt_in_has_no_features_and_is_masked_in_the_dataset() {
     photograph(&photos.join("masks/v04.png"), SIZE, 0.0);
     model(9).write_binary(&root.join("models/0"));
     stub(root, &format!("feature_extractor) cp -r $masks $root/seen;;\n{MODELS}"));
-    says(&places(&pose(root), 9, 9), &[" % of the photographs of 40x30 hardly changes"]);
+    says(&finds_cameras(&pose(root), 9, 9), &[" % of the photographs of 40x30 hardly changes"]);
     let shown =
         |mask: &Path, x: u32, y: u32| Image::load(mask).unwrap().data[(40 * y + x) as usize] > 0.0;
     for mask in [seen.join("v03.png.png"), seen.join("v08.png.png"), out.join("masks/v08.png")] {
@@ -176,7 +176,7 @@ fn a_dim_dashboard_has_no_features() {
     }
     model(9).write_binary(&root.join("models/0"));
     stub(root, &format!("feature_extractor) cp -r $masks $root/seen;;\n{MODELS}"));
-    says(&places(&pose(root), 9, 9), &["hardly changes between views that move"]);
+    says(&finds_cameras(&pose(root), 9, 9), &["hardly changes between views that move"]);
     let mask = Image::load(seen.join("v08.png.png")).unwrap();
     let pixels = || (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
     let is_shown = |x: u32, y: u32| mask.data[(width * y + x) as usize] > 0.0;

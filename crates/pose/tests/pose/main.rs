@@ -74,7 +74,7 @@ fn estimated(options: &PoseOptions) -> (Result<Posed>, String) {
 
 /// [`estimated`], of which this many photographs of all must have a camera.
 #[track_caller]
-fn places(options: &PoseOptions, placed: usize, all: usize) -> String {
+fn finds_cameras(options: &PoseOptions, placed: usize, all: usize) -> String {
     let (posed, told) = estimated(options);
     let posed = posed.unwrap_or_else(|error| panic!("{error}: {told}"));
     assert_eq!((posed.placed, posed.photographs), (placed, all), "{told}");

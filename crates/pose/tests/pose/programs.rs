@@ -9,7 +9,7 @@ use nightsplat_pose::{Mapper, PoseFeatures, PoseOptions};
 use crate::common::{Folder, says};
 use crate::stub::{MODELS, SEEN, learned_stub, nothing_is_left, photographed, stub};
 use crate::synthetic::{load, model, pack};
-use crate::{places, pose, refused};
+use crate::{finds_cameras, pose, refused};
 
 /// One photograph in nine has no camera, so all are matched again.
 #[test]
@@ -19,7 +19,7 @@ fn a_failed_second_matching_keeps_the_cameras_of_the_first() {
     model(8).write_binary(&root.join("models/0"));
     let once = "[ -e $root/once ] && exit 9; touch $root/once; cp -r $root/models/* $output";
     stub(root, &format!("mapper) {once};;"));
-    says(&places(&pose(root), 8, 9), &["using the cameras found so far"]);
+    says(&finds_cameras(&pose(root), 8, 9), &["using the cameras found so far"]);
 }
 
 #[test]
@@ -36,7 +36,7 @@ fn cameras_are_registered_globally_by_colmap_or_else_by_glomap() {
     let nowhere = || PathBuf::from("/nowhere/glomap");
     // COLMAP has this command from 4.0 on.
     stub(root, "help) echo global_mapper;;\nglobal_mapper) cp -r $root/models/* $output;;");
-    places(&globally("new", nowhere()), 8, 9);
+    finds_cameras(&globally("new", nowhere()), 8, 9);
     let log = root.text("new/colmap.log");
     let calibrated = log.find(" view_graph_calibrator --database_path").unwrap();
     assert!(log.find(" global_mapper --database_path").unwrap() > calibrated, "{log}");
@@ -44,7 +44,7 @@ fn cameras_are_registered_globally_by_colmap_or_else_by_glomap() {
     stub(root, MODELS);
     fs::rename(root.join("colmap-stub"), root.join("glomap")).unwrap();
     stub(root, "mapper) exit 9;;");
-    places(&globally("old", root.join("glomap")), 8, 9);
+    finds_cameras(&globally("old", root.join("glomap")), 8, 9);
     assert_eq!(load(&root.join("old")).views.len(), 8);
     let lost = "global_mapper) echo 'failed to create sparse model'; exit 1;;";
     stub(root, &format!("help) echo global_mapper;;\n{lost}"));
@@ -111,7 +111,7 @@ fn few_photographs_start_from_a_closer_pair_and_options_go_to_their_command() {
         stub(root, &format!("mapper) [ \"$angle\" = {angle} ] && {copy}; exit 0;;"));
     };
     for_angle(2);
-    let told = places(&pose(root), 9, 9);
+    let told = finds_cameras(&pose(root), 9, 9);
     assert_eq!(told.matches("registering again, from a closer pair").count(), 2, "{told}");
     let relaxed = "--Mapper.init_max_forward_motion 1 --Mapper.init_min_num_inliers 50";
     says(&root.text("scene/colmap.log"), &[relaxed]);
@@ -119,7 +119,7 @@ fn few_photographs_start_from_a_closer_pair_and_options_go_to_their_command() {
     // The user's value is the only one.
     for_angle(3);
     let colmap_options = vec!["Mapper.init_min_tri_angle=3".to_owned()];
-    places(&PoseOptions { colmap_options, overwrite: true, ..pose(root) }, 9, 9);
+    finds_cameras(&PoseOptions { colmap_options, overwrite: true, ..pose(root) }, 9, 9);
     let log = root.text("scene/colmap.log");
     assert_eq!(log.matches("init_min_tri_angle").count(), 1, "{log}");
 }
@@ -134,7 +134,7 @@ fn learned_features_are_tried_where_most_photographs_have_no_camera() {
         root,
         "mapper) case $database in */learned-*) cp -r $root/all/* $output;; *) cp -r $root/some/* $output;; esac;;",
     );
-    let told = places(&pose(root), 9, 9);
+    let told = finds_cameras(&pose(root), 9, 9);
     let plan = "SIFT features; if most photographs have no camera, learned ones too";
     says(&told, &[plan, "4 of 9 have a camera: learned features, for at most 2 min"]);
     assert!(!told.contains("matching again"), "{told}");
@@ -147,12 +147,12 @@ fn learned_features_are_tried_where_most_photographs_have_no_camera() {
 
     // On request, they are the first and only ones.
     let asked = |features| PoseOptions { features: Some(features), overwrite: true, ..pose(root) };
-    let told = places(&asked(PoseFeatures::Learned), 9, 9);
+    let told = finds_cameras(&asked(PoseFeatures::Learned), 9, 9);
     says(&told, &["learned features: ALIKED, matched by LightGlue"]);
     let log = root.text("scene/colmap.log");
     assert_eq!((log.matches("$ ").count(), log.matches("ALIKED_N16ROT").count()), (3, 1), "{log}");
     // With SIFT asked for, none are tried.
-    let told = places(&PoseOptions { patience: 0.1, ..asked(PoseFeatures::Sift) }, 4, 9);
+    let told = finds_cameras(&PoseOptions { patience: 0.1, ..asked(PoseFeatures::Sift) }, 4, 9);
     assert!(!told.contains("learned"), "{told}");
 }
 
@@ -177,7 +177,7 @@ fn a_colmap_without_learned_features_or_their_networks_is_told_with_the_remedy()
         "feature_extractor) case $database in */learned-*) echo 'requires ONNX support' >&2; exit 1;; esac;;\n\
          mapper) case $database in */guided.db) cp -r $root/all/* $output;; *) cp -r $root/some/* $output;; esac;;",
     );
-    let told = places(&pose(root), 9, 9);
+    let told = finds_cameras(&pose(root), 9, 9);
     let parts =
         ["built without ONNX", "going on with SIFT", "4 of 9 have a camera: matching again"];
     says(&told, &parts);
@@ -189,6 +189,6 @@ fn an_archive_of_photographs_is_read_in_place() {
     pack(&photographed(root), &root.join("photos.zip"), "scan/");
     model(9).write_binary(&root.join("models/0"));
     stub(root, MODELS);
-    places(&PoseOptions { photos: root.join("photos.zip"), ..pose(root) }, 9, 9);
+    finds_cameras(&PoseOptions { photos: root.join("photos.zip"), ..pose(root) }, 9, 9);
     assert_eq!(load(&root.join("scene")).views.len(), 9);
 }
