@@ -46,9 +46,15 @@ pub(crate) fn ends(child: Child, code: i32, parts: &[&str]) -> String {
 /// Until there is a file, and something in it.
 #[track_caller]
 pub(crate) fn wait_for(path: &Path) {
+    let there = || fs::metadata(path).is_ok_and(|file| file.len() > 0);
+    wait_until(&format!("{} comes", path.display()), there);
+}
+
+#[track_caller]
+pub(crate) fn wait_until(what: &str, so: impl Fn() -> bool) {
     let begin = Instant::now();
-    while fs::metadata(path).map_or(true, |file| file.len() == 0) {
-        assert!(begin.elapsed() < Duration::from_secs(120), "{} does not come", path.display());
+    while !so() {
+        assert!(begin.elapsed() < Duration::from_secs(120), "waited in vain until {what}");
         std::thread::sleep(Duration::from_millis(10));
     }
 }

@@ -6,7 +6,7 @@ use super::stub::{MODELS, photographed, stub};
 use super::synthetic::*;
 use crate::common::command::{command, run, says, succeed};
 use crate::common::prelude::*;
-use crate::common::process::{ended, send, spawned, wait_for};
+use crate::common::process::{ended, send, spawned, wait_for, wait_until};
 
 /// Options of a training of seconds.
 const TRAINED: &str = "--curve ap3 --model plain --sh-degree 0 --no-open";
@@ -30,6 +30,7 @@ fn a_folder_becomes_a_page_by_one_command_that_goes_on_in_every_stage() {
     let photos = photographed(root);
     waiting(root);
     let made = root.join("photos-splat");
+    let lock = made.join("dataset.partial/.lock");
     let line = root.named(&format!("@photos --colmap @colmap-stub --steps 2000 {TRAINED}"));
 
     // Stopped while COLMAP matches.
@@ -53,9 +54,13 @@ fn a_folder_becomes_a_page_by_one_command_that_goes_on_in_every_stage() {
     fs::remove_file(root.join("waits")).unwrap();
     let mut child = spawned(&mut command(&line));
     wait_for(&root.join("waits"));
+    let orphan = root.text("waits");
+    // COLMAP can have begun before the lock has its name.
+    wait_until("the lock names COLMAP", || {
+        fs::read_to_string(&lock).is_ok_and(|name| name == orphan)
+    });
     child.kill().unwrap();
     child.wait().unwrap();
-    let orphan = root.text("waits");
     let (_, text) = run(&line, 1);
     let refused = format!("process {} works in it", orphan.trim());
     assert!(text.lines().last().unwrap().contains(&refused), "{text}");
