@@ -250,6 +250,11 @@ impl TermInputs<'_> {
 
 /// A term of the render.
 pub trait LossTerm: std::fmt::Debug + Send {
+    /// Compiles, ahead of [`Self::prepare`], what that compiles for views of some sizes.
+    fn compile(&mut self) -> Result<()> {
+        Ok(())
+    }
+
     /// Allocates scratch memory for these views, and prepares the target of each.
     fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()>;
 
@@ -290,6 +295,11 @@ impl Losses {
         }
         let has_planes = config.features != Features::NONE || config.weights.normals > 0.0;
         Ok(Self { terms, has_planes })
+    }
+
+    /// Compiles the kernels of views of any size.
+    pub(crate) fn compile(&mut self) -> Result<()> {
+        self.terms.iter_mut().try_for_each(|term| term.compile())
     }
 
     /// Prepares the data that is constant for these views, and allocates for them.

@@ -216,6 +216,13 @@ impl ImageKernels {
 }
 
 impl LossTerm for Loss {
+    fn compile(&mut self) -> Result<()> {
+        match &mut self.kernels {
+            ImageKernels::Ssim(ssim) => ssim.compile(),
+            ImageKernels::L1 { .. } => Ok(()),
+        }
+    }
+
     fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()> {
         views.iter().try_for_each(|view| self.reserve(view.size))
     }

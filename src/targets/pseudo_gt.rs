@@ -72,6 +72,11 @@ impl PseudoGt {
         })
     }
 
+    /// Compiles the kernel for photographs of the host.
+    pub(crate) fn compile(&self) -> Result<()> {
+        self.pipeline(32, true).map(drop)
+    }
+
     pub(crate) fn gpu(&self) -> &Gpu {
         &self.gpu
     }

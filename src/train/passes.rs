@@ -1,12 +1,15 @@
 //! The kernels of a step.
 
+use std::panic::resume_unwind;
+use std::thread;
+
 use nightsplat_core::random::Stream;
+use nightsplat_core::watch::Watch;
 use nightsplat_models::gaussians::Shape;
 use nightsplat_photographs::dataset::Dataset;
 
 use super::config::{Background, DensityConfig, TrainConfig};
 use super::streams;
-use crate::Result;
 use crate::gpu::Gpu;
 use crate::loss::Losses;
 use crate::splats::batches::GradientKind;
@@ -14,6 +17,8 @@ use crate::splats::densify::{Densifier, DensifySettings};
 use crate::splats::optimizer::{Adam, FiniteCheck};
 use crate::splats::render::{RenderSettings, Renderer};
 use crate::splats::smoothing::SmoothingFloor;
+use crate::targets::pseudo_gt::PseudoGt;
+use crate::{Error, Result};
 
 /// Kernels that depend only on the device and the settings.
 pub(super) struct TrainKernels {
@@ -27,15 +32,8 @@ pub(super) struct TrainKernels {
 
 impl TrainKernels {
     pub(super) fn new(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
-        let (rest, settings) = (config.precision.rest, config.render_settings());
-        let shape = Shape { sh_degree: first_sh_degree(config), ..settings.shape };
         Ok(Self {
-            renderer: Renderer::with_gradients(
-                gpu,
-                RenderSettings { rest, shape, ..settings },
-                GradientKind::on(gpu, [rest, config.precision.moments]),
-                config.frozen_columns(),
-            )?,
+            renderer: renderer(gpu, config)?,
             losses: Losses::new(gpu, &config.loss())?,
             adam: Adam::with_frozen(gpu, config.frozen_columns())?,
             finite: FiniteCheck::new(gpu)?,
@@ -43,6 +41,43 @@ impl TrainKernels {
             densifier: densifier(gpu, config, dataset)?,
         })
     }
+}
+
+/// Does other work while another thread compiles the kernels that need no dataset: as long as the work takes, and one
+/// kernel longer. [`TrainKernels::new`] finds them, unless a plan asks for others. An error of the work comes first.
+pub(super) fn while_compiling<T>(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    work: impl FnOnce() -> Result<T>,
+) -> Result<T> {
+    let compile = || {
+        PseudoGt::new(gpu, &config.tone)?.compile()?;
+        renderer(gpu, config)?;
+        Losses::new(gpu, &config.loss())?.compile()?;
+        Adam::with_frozen(gpu, config.frozen_columns())?;
+        FiniteCheck::new(gpu).map(drop)
+    };
+    let watch = Watch::default();
+    thread::scope(|scope| {
+        let beside = scope.spawn(|| watch.within(compile));
+        let done = work();
+        watch.stop();
+        match beside.join().unwrap_or_else(|panic| resume_unwind(panic)) {
+            Ok(()) | Err(Error::Halted { .. }) => done,
+            Err(error) => done.and(Err(error)),
+        }
+    })
+}
+
+fn renderer(gpu: &Gpu, config: &TrainConfig) -> Result<Renderer> {
+    let (rest, settings) = (config.precision.rest, config.render_settings());
+    let shape = Shape { sh_degree: first_sh_degree(config), ..settings.shape };
+    Renderer::with_gradients(
+        gpu,
+        RenderSettings { rest, shape, ..settings },
+        GradientKind::on(gpu, [rest, config.precision.moments]),
+        config.frozen_columns(),
+    )
 }
 
 /// The smoothing floor of the training views, in the frame, if it is on.
@@ -86,5 +121,33 @@ pub(super) fn background(config: &TrainConfig, step: u64) -> [f32; 3] {
             let stream = Stream::new(config.seed, streams::BACKGROUND);
             std::array::from_fn(|c| stream.uniform(3 * step + c as u64) as f32)
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, Instant};
+
+    use super::*;
+    use crate::gpu::DeviceChoice;
+    use crate::gpu::testing::compiled;
+
+    #[test]
+    fn kernels_are_compiled_beside_work_and_no_more_of_them_once_it_fails() {
+        // A device of its own: another test's would have them.
+        let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+        let before = compiled(&gpu);
+        let failed = while_compiling::<()>(&gpu, &TrainConfig::default(), || {
+            let begin = Instant::now();
+            while compiled(&gpu) == before {
+                assert!(begin.elapsed() < Duration::from_secs(60));
+                thread::yield_now();
+            }
+            Err(Error::Usage("no such dataset".to_owned()))
+        });
+        assert_eq!(failed.unwrap_err().to_string(), "no such dataset");
+        let some = compiled(&gpu) - before;
+        renderer(&gpu, &TrainConfig::default()).unwrap();
+        assert!((1..compiled(&gpu) - before).contains(&some), "{some}");
     }
 }

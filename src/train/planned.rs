@@ -9,6 +9,7 @@ use toml::Value;
 
 use super::config::TrainConfig;
 use super::layers::{Origin, Settings, SettingsLayer};
+use super::passes::while_compiling;
 use super::plan::{Plan, PlannedPart};
 use super::preset::Preset;
 use super::trainer::Trainer;
@@ -112,12 +113,14 @@ impl RequestedSettings {
             options.falloff = options.falloff.or(falloff.on.then_some(falloff.falloff));
             options.bands = options.bands.or(bands.on.then_some(bands.rows));
         }
-        let (mut dataset, plan) = if planning == PlanSource::Diagnosis {
-            let (dataset, diagnosis) = Diagnosis::load(&config.dataset, &options)?;
-            (dataset, Some(planned(&diagnosis, &config, gpu)))
-        } else {
-            (Dataset::load(&config.dataset, &options)?, None)
-        };
+        let (mut dataset, plan) = while_compiling(gpu, &config, || {
+            if planning == PlanSource::Diagnosis {
+                let (dataset, diagnosis) = Diagnosis::load(&config.dataset, &options)?;
+                Ok((dataset, Some(planned(&diagnosis, &config, gpu))))
+            } else {
+                Ok((Dataset::load(&config.dataset, &options)?, None))
+            }
+        })?;
         let mut plan = match planning {
             PlanSource::File(file) => Some(Plan::load(file, &dataset)?),
             _ => plan,

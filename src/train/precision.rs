@@ -6,7 +6,7 @@ use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
 use rayon::iter::{IndexedParallelIterator, ParallelIterator};
 use rayon::slice::ParallelSlice;
-use rustc_hash::{FxHashMap, FxHashSet};
+use rustc_hash::{FxBuildHasher, FxHashMap, FxHashSet};
 use serde::{Deserialize, Serialize};
 
 use crate::Result;
@@ -140,7 +140,8 @@ fn palette(values: &[f32], bits: PhotographBits) -> Option<Vec<u32>> {
 
 /// The bits of all different values, ascending; `None` if there are more than `most`.
 fn different(values: &[f32], most: usize) -> Option<Vec<u32>> {
-    let mut found = FxHashSet::default();
+    let capacity = values.len().min(most + 1);
+    let mut found = FxHashSet::with_capacity_and_hasher(capacity, FxBuildHasher);
     let mut last = None;
     for bits in values.iter().map(|value| value.to_bits()) {
         // In dark photographs, neighbours are often equal.

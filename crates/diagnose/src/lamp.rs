@@ -101,8 +101,7 @@ impl LampDiagnosis {
     /// Measures observations.
     pub(super) fn new(rows: &LampObservations) -> Result<Self, String> {
         rows.check_distances()?;
-        let left = Left::new(rows);
-        let fit = rows.fit(ALL, true);
+        let (left, fit) = rayon::join(|| Left::new(rows), || rows.fit(ALL, true));
         let [exponent, k1, k2, ambient] = fit.coefficients;
         let stops = |more: f64, less: f64| (more - less).max(0.0).sqrt();
         let share = |variance: f64| 1.0 - variance / left.total.max(f64::MIN_POSITIVE);

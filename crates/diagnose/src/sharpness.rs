@@ -22,21 +22,26 @@ pub(super) fn blur(luminance: &[f32], width: usize) -> Option<f64> {
     }
     let first = blurred(luminance, width, FIRST);
     let second = blurred(&first, width, SECOND);
-    let inside = |&index: &usize| {
-        let (x, y) = (index % width, index / width);
-        (4..width - 4).contains(&x) && (4..height - 4).contains(&y)
-    };
     let gradient = |plane: &[f32], index: usize| {
         let (dx, dy) =
             (plane[index + 1] - plane[index - 1], plane[index + width] - plane[index - width]);
-        f64::from(dx).hypot(f64::from(dy))
+        [f64::from(dx), f64::from(dy)]
     };
-    let mut edges: Vec<(f64, usize)> =
-        (0..width * height).filter(inside).map(|index| (gradient(&second, index), index)).collect();
+    let square = |[dx, dy]: [f64; 2]| dx * dx + dy * dy;
+    let mut edges: Vec<(f64, usize)> = Vec::with_capacity((width - 8) * (height - 8));
+    for first in (4..height - 4).map(|y| y * width) {
+        let inside = first + 4..first + width - 4;
+        edges.extend(inside.map(|index| (square(gradient(&second, index)), index)));
+    }
     let count = ((edges.len() as f64 * EDGES) as usize).max(1).min(edges.len());
     edges.select_nth_unstable_by(count - 1, |a, b| b.0.total_cmp(&a.0));
-    let ratio = |&(blurred, index): &(f64, usize)| gradient(&first, index) / blurred;
-    let mut ratios: Vec<f64> = edges[..count].iter().filter(|e| e.0 > 1e-6).map(ratio).collect();
+    let length = |plane, index| {
+        let [dx, dy] = gradient(plane, index);
+        dx.hypot(dy)
+    };
+    let of_edge = |&(_, index): &(f64, usize)| (length(&first, index), length(&second, index));
+    let lengths = edges[..count].iter().map(of_edge).filter(|(_, blurred)| *blurred > 1e-6);
+    let mut ratios: Vec<f64> = lengths.map(|(sharp, blurred)| sharp / blurred).collect();
     if ratios.is_empty() {
         return None;
     }
@@ -54,20 +59,31 @@ fn blurred(plane: &[f32], width: usize, sigma: f64) -> Vec<f32> {
     let sum: f32 = kernel.iter().sum();
     kernel.iter_mut().for_each(|weight| *weight /= sum);
     let height = plane.len() / width;
-    let along = |source: &[f32], step: usize, last: usize, position: fn(usize, usize) -> usize| {
-        let value = |index: usize| {
-            let here = position(index, width) as isize;
-            let taps = kernel.iter().zip(-reach..);
-            let tap = |(weight, x): (&f32, isize)| {
-                let there = (here + x).clamp(0, last as isize - 1);
-                weight * source[(index as isize + (there - here) * step as isize) as usize]
-            };
-            taps.map(tap).sum()
-        };
-        (0..source.len()).map(value).collect::<Vec<f32>>()
-    };
-    let rows = along(plane, 1, width, |index, width| index % width);
-    along(&rows, width, height, |index, width| index / width)
+    let reach = reach as usize;
+    let mut across = Vec::with_capacity(plane.len());
+    for row in plane.chunks_exact(width) {
+        let mut padded = vec![row[0]; reach];
+        padded.extend_from_slice(row);
+        padded.extend(std::iter::repeat_n(row[width - 1], reach));
+        across.extend(weighted(&kernel, width, |tap| &padded[tap..][..width]));
+    }
+    let mut down = Vec::with_capacity(plane.len());
+    for y in 0..height {
+        let row = |tap: usize| &across[(y + tap).saturating_sub(reach).min(height - 1) * width..];
+        down.extend(weighted(&kernel, width, row));
+    }
+    down
+}
+
+/// The sum of a row for each tap of the kernel, each with its weight.
+fn weighted<'a>(kernel: &[f32], width: usize, row: impl Fn(usize) -> &'a [f32]) -> Vec<f32> {
+    let mut sums = vec![0.0; width];
+    for (tap, weight) in kernel.iter().enumerate() {
+        for (sum, value) in sums.iter_mut().zip(row(tap)) {
+            *sum += weight * value;
+        }
+    }
+    sums
 }
 
 #[cfg(test)]

@@ -89,12 +89,11 @@ fn layout_of(size: UVec2) -> usize {
 }
 
 impl StripKernels {
-    fn kernel(&mut self, size: UVec2) -> Result<&Pipeline<ssim::Kernel>> {
-        let index = layout_of(size);
-        match &mut self.compiled[index] {
+    fn kernel(&mut self, layout: usize) -> Result<&Pipeline<ssim::Kernel>> {
+        match &mut self.compiled[layout] {
             Some(kernel) => Ok(kernel),
             missing => {
-                let SsimLayout { columns, rows, alignment } = LAYOUTS[index];
+                let SsimLayout { columns, rows, alignment } = LAYOUTS[layout];
                 let constants = ssim::Constants { columns, rows, alignment, adds: self.adds };
                 Ok(missing.insert(self.gpu.pipeline(&constants)?))
             }
@@ -123,11 +122,21 @@ impl SsimLoss {
         Ok(Self { weight, lanes: gpu.properties().subgroup_size, kernels })
     }
 
+    /// Compiles the kernels of views of any size.
+    pub(super) fn compile(&mut self) -> Result<()> {
+        match &mut self.kernels {
+            SsimKernels::One(kernels) => {
+                (0..LAYOUTS.len()).try_for_each(|layout| kernels.kernel(layout).map(drop))
+            }
+            SsimKernels::Two { .. } => Ok(()),
+        }
+    }
+
     /// Allocates scratch memory for views of up to `values` values, which never shrinks, and compiles what a view of
     /// `size` needs.
     pub(super) fn reserve(&mut self, gpu: &Gpu, size: UVec2, values: u32) -> Result<()> {
         match &mut self.kernels {
-            SsimKernels::One(kernels) => kernels.kernel(size).map(drop),
+            SsimKernels::One(kernels) => kernels.kernel(layout_of(size)).map(drop),
             SsimKernels::Two { derivatives, .. } => {
                 derivatives.iter_mut().try_for_each(|buffer| buffer.grow(gpu, values as usize))
             }
@@ -164,7 +173,7 @@ impl SsimLoss {
         let (forward, backward, [d_mean, d_square, d_product], arrivals) = match &mut self.kernels {
             SsimKernels::One(kernels) => {
                 pass.dispatch(
-                    kernels.kernel(size)?,
+                    kernels.kernel(layout_of(size))?,
                     &ssim::Params { width, height, loss_begin, loss_end, l1_scale, ssim_scale },
                     ssim::Buffers {
                         render: render.slice(),

@@ -5,7 +5,7 @@
 //! lost than necessary. Of a fisheye it shows at most [`WIDEST`] off the axis: a pinhole spends ever more pixels on
 //! larger angles, and cannot show 90 degrees.
 
-use glam::DVec2;
+use glam::{DVec2, Vec4};
 use nightsplat_core::camera::Lens;
 use rayon::prelude::*;
 
@@ -124,7 +124,7 @@ fn fits(lens: &Lens, zoom: f64, widest: f64) -> bool {
 /// negative light.
 struct Taps {
     columns: [usize; 4],
-    across: [f32; 4],
+    across: Vec4,
     /// Start indices of the four rows.
     rows: [usize; 4],
     down: [f32; 4],
@@ -134,25 +134,37 @@ impl Taps {
     fn at([x, y]: [f32; 2], width: usize, height: usize) -> Self {
         let (columns, across) = cubic(x, width);
         let (rows, down) = cubic(y, height);
-        Self { columns, across, rows: rows.map(|row| row * width), down }
+        Self { columns, across: across.into(), rows: rows.map(|row| row * width), down }
     }
 
     /// All planes at once: one plane's sum waits for each addition, three keep the processor busy.
     fn sample<const N: usize>(&self, planes: [&[f32]; N]) -> [f32; N] {
-        let (mut sum, mut low, mut high) = ([0.0; N], [f32::INFINITY; N], [f32::NEG_INFINITY; N]);
+        let mut sum = [0.0; N];
+        let mut range = [[Vec4::INFINITY, Vec4::NEG_INFINITY]; N];
         for (row, down) in self.rows.iter().zip(self.down) {
-            for (column, across) in self.columns.iter().zip(self.across) {
-                let weight = down * across;
-                for plane in 0..N {
-                    let value = planes[plane][row + column];
-                    sum[plane] += weight * value;
-                    // Not `min` and `max`, which first check for NaN.
-                    low[plane] = if value < low[plane] { value } else { low[plane] };
-                    high[plane] = if value > high[plane] { value } else { high[plane] };
+            let weights = down * self.across;
+            for plane in 0..N {
+                let values = self.columns_of(&planes[plane][*row..]);
+                for product in (weights * values).to_array() {
+                    sum[plane] += product;
                 }
+                let [low, high] = range[plane];
+                range[plane] = [values.min(low), values.max(high)];
             }
         }
-        std::array::from_fn(|plane| sum[plane].max(low[plane]).min(high[plane]))
+        std::array::from_fn(|plane| {
+            let [low, high] = range[plane];
+            sum[plane].max(low.min_element()).min(high.max_element())
+        })
+    }
+
+    fn columns_of(&self, row: &[f32]) -> Vec4 {
+        let [first, .., last] = self.columns;
+        if last == first + 3 {
+            Vec4::from_slice(&row[first..=last])
+        } else {
+            self.columns.map(|column| row[column]).into()
+        }
     }
 }
 
