@@ -28,7 +28,7 @@ pub(super) enum Grid {
 /// The changes of balanced.
 const CHANGES: [(&str, &[&str]); 8] = [
     ("steps", &["500", "1000"]),
-    ("stop.gain", &["0.02", "0.1"]),
+    ("stop.gain", &["0.05", "0.2"]),
     // Steps at a quarter and at half resolution; `balanced` has 0 and 1 000.
     ("schedule.resolution_steps", &["[0,0]", "[0,2000]"]),
     ("schedule.initial_rate_factor", &["1"]),

@@ -16,7 +16,7 @@ pub struct StopConfig {
     every: u64 = 250 => Rule::at_least(1), in "steps";
     /// The run has converged once two scores in a row do not exceed the best before by this much, nor their detail by
     /// `stop.detail_gain`; it then cools down and ends.
-    gain: f64 = 0.05 => Rule::POSITIVE_OR_0, in "dB";
+    gain: f64 = 0.1 => Rule::POSITIVE_OR_0, in "dB";
     /// Detail is the SSIM of the held-out views after the least-squares gain and bias of each channel: it grows when
     /// PSNR, which follows the brightness of the views, has converged.
     detail_gain: f64 = 0.001 => Rule::POSITIVE_OR_0, in "SSIM";
