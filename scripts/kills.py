@@ -11,13 +11,17 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def write(path, kills, tests=()):
-    """Writes the failing tests of each defect, and prints each test with its kills and those that are its alone.
+def save(path, kills):
+    """Writes the failing tests of each defect."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(kills, indent=1, sort_keys=True) + "\n")
+
+
+def show(path, kills, tests=()):
+    """Prints each test with its kills and those that are its alone, of the table in the file.
 
     kills: the names of the tests that fail, by defect; tests: those that ran, also if they caught nothing.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(kills, indent=1, sort_keys=True) + "\n")
     promises = (ROOT / "docs/promises.md").read_text()
     found = Counter(test for failed in kills.values() for test in failed)
     alone = Counter(failed[0] for failed in kills.values() if len(failed) == 1)

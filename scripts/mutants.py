@@ -320,7 +320,9 @@ def main():
     if options.every:
         found = {name: own[2] for name, own in verdicts.items()}
         ran = [f"{test['program']}: {test['name']}" for test in tests if test["passes"]]
-        kills.write(ROOT / "target/kills/mutants.json", found, ran)
+        table = ROOT / "target/kills/mutants.json"
+        kills.save(table, found)
+        kills.show(table, found, ran)
     columns = ["caught", "missed", "unreached", "unviable", "unplanted", "not run"]
     print(f"{'':12}" + "".join(f"{column:>11}" for column in columns))
     for module, count in counts.items():

@@ -7,9 +7,11 @@ Each defect is one replacement in one file, which is always restored. Its tests 
 fail. Exit code 1 if a defect survives, or if the text to replace is no longer there.
 
 --every runs all tests of the program instead of those that the defect names, and writes the table of kills,
-target/kills/planted.json: every test that fails for each defect, and the tests that are not needed.
+target/kills/planted.json: every test that fails for each defect, and the tests that are not needed. It takes hours, and
+goes on where it was interrupted: a defect in the table is not planted again until the table is removed.
 """
 
+import json
 import re
 import signal
 import subprocess
@@ -19,6 +21,7 @@ from pathlib import Path
 import kills
 
 ROOT = Path(__file__).resolve().parent.parent
+TABLE = ROOT / "target/kills/planted.json"
 
 # name, file, text, its replacement, arguments of `cargo test`
 DEFECTS = [
@@ -203,14 +206,16 @@ def main():
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))
     every = "--every" in sys.argv
     wanted = " ".join(word for word in sys.argv[1:] if word != "--every")
-    found = {}
+    found = json.loads(TABLE.read_text()) if every and TABLE.exists() else {}
     for name, file, before, after, arguments in DEFECTS:
-        if wanted in name:
+        if wanted in name and name not in found:
             words = arguments.split()
             said, found[name] = plant(file, before, after, " ".join(words[:2]) if every else arguments)
             print(f"{'caught' if found[name] else 'MISSED'}  {name} ({file}): {said}", flush=True)
+            if every:
+                kills.save(TABLE, {name: failed for name, failed in found.items() if failed})
     if every:
-        kills.write(ROOT / "target/kills/planted.json", found)
+        kills.show(TABLE, found)
     survivors = sum(not failed for failed in found.values())
     sys.exit(survivors > 0)
 

@@ -11,6 +11,7 @@ mod common;
 
 mod facts;
 mod levels;
+mod ply;
 mod properties;
 mod scene;
 mod streamed;
