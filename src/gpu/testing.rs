@@ -8,7 +8,7 @@ use ash::vk;
 pub use nightsplat_core::testing::not_run;
 
 pub use super::faults::Faults;
-use super::{DeviceChoice, Gpu, GpuShared, Interface, Properties};
+use super::{DeviceChoice, Gpu, GpuShared, Interface, Properties, Sorting, TunedTile};
 
 static GPU: OnceLock<Gpu> = OnceLock::new();
 
@@ -46,6 +46,18 @@ pub fn gpu_that_binds(bytes: u64) -> Gpu {
 /// As [`gpu`].
 pub fn gpu_with(adapt: impl FnOnce(&mut Properties)) -> Gpu {
     open(|shared| adapt(&mut shared.properties))
+}
+
+/// Another device with validation, a GPU by its properties, where a sort of each tile was measured to be the fastest.
+///
+/// # Panics
+/// As [`gpu`].
+pub fn gpu_that_sorts_tiles() -> Gpu {
+    open(|shared| {
+        shared.properties.is_cpu = false;
+        let tile = TunedTile { channels: 3, tile: [16, 16].into(), sorting: Sorting::Tiles };
+        shared.tuned_tiles = OnceLock::from(vec![tile]);
+    })
 }
 
 /// A kernel's module, frozen with these constants for subgroups of this size.

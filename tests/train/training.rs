@@ -2,7 +2,7 @@
 
 use nightsplat::Error;
 use nightsplat::gpu::DeviceChoice;
-use nightsplat::gpu::testing::{recorded, submitted};
+use nightsplat::gpu::testing::{gpu_that_sorts_tiles, recorded, submitted};
 use nightsplat::results::eval::{self, After, Metric, ModelRenderer};
 use nightsplat::splats::densify::DensityControl;
 use nightsplat::splats::model::Model;
@@ -229,6 +229,8 @@ fn a_plain_step_is_at_most_18_dispatches_and_barriers_on_a_gpu_and_in_small_view
         (cpu, [64, 48], [18, 16]),
         (gpu_with(|properties| properties.is_cpu = false), [64, 48], [16, 15]),
         (gpu_with(|properties| properties.is_cpu = false), large, [17, 16]),
+        (gpu_that_sorts_tiles(), [64, 48], [13, 12]),
+        (gpu_that_sorts_tiles(), large, [13, 12]),
     ] {
         let dataset = crate::common::train::dataset(4, size);
         for (bits, more) in [(StorageFormat::Single, 0), (StorageFormat::Half, 1)] {
