@@ -6,11 +6,12 @@ use std::thread;
 use nightsplat_core::random::Stream;
 use nightsplat_core::watch::Watch;
 use nightsplat_models::gaussians::Shape;
-use nightsplat_photographs::dataset::Dataset;
+use nightsplat_photographs::dataset::{Dataset, Photograph};
+use nightsplat_photographs::image::PictureFile;
 
 use super::config::{Background, DensityConfig, TrainConfig};
 use super::streams;
-use crate::gpu::Gpu;
+use crate::gpu::{Gpu, Tile};
 use crate::loss::Losses;
 use crate::splats::batches::GradientKind;
 use crate::splats::densify::{Densifier, DensifySettings};
@@ -43,30 +44,46 @@ impl TrainKernels {
     }
 }
 
-/// Does other work while another thread compiles the kernels that need no dataset: as long as the work takes, and one
-/// kernel longer. [`TrainKernels::new`] finds them, unless a plan asks for others. An error of the work comes first.
+/// Loads the dataset while another thread compiles the kernels for views of the size of its first photograph: as long as
+/// loading takes, and one kernel longer. [`TrainKernels::new`] finds them, unless a plan or the other views ask for
+/// others. An error of `load` comes first.
 pub(super) fn while_compiling<T>(
     gpu: &Gpu,
     config: &TrainConfig,
-    work: impl FnOnce() -> Result<T>,
+    load: impl FnOnce() -> Result<T>,
 ) -> Result<T> {
-    let compile = || {
-        PseudoGt::new(gpu, &config.tone)?.compile()?;
-        renderer(gpu, config)?;
-        Losses::new(gpu, &config.loss())?.compile()?;
-        Adam::with_frozen(gpu, config.frozen_columns())?;
-        FiniteCheck::new(gpu).map(drop)
-    };
     let watch = Watch::default();
     thread::scope(|scope| {
-        let beside = scope.spawn(|| watch.within(compile));
-        let done = work();
+        let beside = scope.spawn(|| watch.within(|| compile(gpu, config)));
+        let loaded = load();
         watch.stop();
         match beside.join().unwrap_or_else(|panic| resume_unwind(panic)) {
-            Ok(()) | Err(Error::Halted { .. }) => done,
-            Err(error) => done.and(Err(error)),
+            Ok(()) | Err(Error::Halted { .. }) => loaded,
+            Err(error) => loaded.and(Err(error)),
         }
     })
+}
+
+/// Compiles the kernels for views of the size of the first photograph.
+fn compile(gpu: &Gpu, config: &TrainConfig) -> Result<()> {
+    // Loading tells what is wrong with the files.
+    let Ok(tile) = first_tile(gpu, config) else { return Ok(()) };
+    let config = &TrainConfig { tile: Some(tile), ..config.clone() };
+    PseudoGt::new(gpu, &config.tone)?.compile()?;
+    renderer(gpu, config)?;
+    Losses::new(gpu, &config.loss())?.compile()?;
+    Adam::with_frozen(gpu, config.frozen_columns())?;
+    FiniteCheck::new(gpu).map(drop)
+}
+
+/// The tile for views of the size of the first photograph.
+fn first_tile(gpu: &Gpu, config: &TrainConfig) -> Result<Tile> {
+    let options = config.load_options();
+    let (photographs, ..) = Dataset::listed(&config.dataset, &options)?;
+    let size = |file: &Photograph| PictureFile::open(&file.input)?.size();
+    let first = photographs.first().map(size).transpose()?;
+    let size = first.map(|(width, height)| options.loaded_size(width, height));
+    config.render_settings().tile_for(gpu, size.map(<[u32; 2]>::from).into_iter())
 }
 
 fn renderer(gpu: &Gpu, config: &TrainConfig) -> Result<Renderer> {
@@ -128,16 +145,51 @@ pub(super) fn background(config: &TrainConfig, step: u64) -> [f32; 3] {
 mod tests {
     use std::time::{Duration, Instant};
 
+    use nightsplat_synth::SyntheticOptions;
+    use tempfile::TempDir;
+
     use super::*;
-    use crate::gpu::DeviceChoice;
-    use crate::gpu::testing::compiled;
+    use crate::gpu::testing::{compiled, gpu_with};
+    use crate::train::Trainer;
+
+    /// Views whose halves need the other kernel of SSIM.
+    const SIZE: [u32; 2] = [132, 96];
+
+    fn set() -> (TempDir, TrainConfig) {
+        let folder = tempfile::tempdir().unwrap();
+        let [width, height] = SIZE;
+        let options = SyntheticOptions { views: 6, width, height, ..SyntheticOptions::default() };
+        nightsplat_synth::write(folder.path(), &options).unwrap();
+        let config = TrainConfig { dataset: folder.path().to_owned(), ..TrainConfig::default() };
+        (folder, config)
+    }
 
     #[test]
-    fn kernels_are_compiled_beside_work_and_no_more_of_them_once_it_fails() {
-        // A device of its own: another test's would have them.
-        let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+    fn a_trainer_uses_every_kernel_that_was_compiled_ahead() {
+        let (_folder, config) = set();
+        let dataset = Dataset::load(&config.dataset, &config.load_options()).unwrap();
+        for is_cpu in [true, false] {
+            // Devices of their own: those of other tests would have the kernels.
+            let [ahead, alone] = [(); 2].map(|()| gpu_with(|own| own.is_cpu &= is_cpu));
+            compile(&ahead, &config).unwrap();
+            let first = compiled(&ahead);
+            let tile = config.render_settings().tile_for(&alone, std::iter::once(SIZE)).unwrap();
+            let [of_both, of_one] = [&ahead, &alone].map(|gpu| {
+                let config = TrainConfig { tile: Some(tile), ..config.clone() };
+                // The first step is that of a smaller view.
+                Trainer::new(gpu, config, &dataset).unwrap().advance(1).unwrap();
+                compiled(gpu)
+            });
+            assert_eq!(of_both, of_one, "CPU: {is_cpu}");
+            assert!(2 * first > of_both, "{first} of {of_both}");
+        }
+    }
+
+    #[test]
+    fn no_more_kernels_are_compiled_once_loading_fails() {
+        let ((_folder, config), gpu) = (set(), gpu_with(|_| ()));
         let before = compiled(&gpu);
-        let failed = while_compiling::<()>(&gpu, &TrainConfig::default(), || {
+        let failed = while_compiling::<()>(&gpu, &config, || {
             let begin = Instant::now();
             while compiled(&gpu) == before {
                 assert!(begin.elapsed() < Duration::from_secs(60));
@@ -147,7 +199,7 @@ mod tests {
         });
         assert_eq!(failed.unwrap_err().to_string(), "no such dataset");
         let some = compiled(&gpu) - before;
-        renderer(&gpu, &TrainConfig::default()).unwrap();
+        compile(&gpu, &config).unwrap();
         assert!((1..compiled(&gpu) - before).contains(&some), "{some}");
     }
 }
