@@ -6,12 +6,10 @@ use nightsplat_core::camera::{Camera, CameraModel};
 use nightsplat_models::attributes::planes;
 use nightsplat_models::gaussians::init::Initialization;
 use nightsplat_models::gaussians::{
-    ATTRIBUTES, Features, Gaussians, SH_C0, Shape, init, ply, rest_coefficients, width,
+    ATTRIBUTES, Features, Gaussians, SH_C0, Shape, init, rest_coefficients, width,
 };
 use nightsplat_photographs::dataset::{Point, Split, View};
 use nightsplat_photographs::image::Image;
-
-use crate::common::{Folder, says};
 
 /// A camera at `position` that looks along +z.
 fn camera(position: DVec3) -> Camera {
