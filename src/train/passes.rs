@@ -44,8 +44,8 @@ impl TrainKernels {
     }
 }
 
-/// Loads the dataset while another thread compiles the kernels for views of the size of its first photograph: as long as
-/// loading takes, and one kernel longer. [`TrainKernels::new`] finds them, unless a plan or the other views ask for
+/// Loads the dataset while another thread compiles the kernels for views of the size of its first photograph: as long
+/// as loading takes, and one kernel longer. [`TrainKernels::new`] finds them, unless a plan or the other views ask for
 /// others. An error of `load` comes first.
 pub(super) fn while_compiling<T>(
     gpu: &Gpu,
@@ -170,7 +170,7 @@ mod tests {
         let dataset = Dataset::load(&config.dataset, &config.load_options()).unwrap();
         for is_cpu in [true, false] {
             // Devices of their own: those of other tests would have the kernels.
-            let [ahead, alone] = [(); 2].map(|()| gpu_with(|own| own.is_cpu &= is_cpu));
+            let [ahead, alone] = [(); 2].map(|()| gpu_with(|device| device.is_cpu &= is_cpu));
             compile(&ahead, &config).unwrap();
             let first = compiled(&ahead);
             let tile = config.render_settings().tile_for(&alone, std::iter::once(SIZE)).unwrap();

@@ -5,7 +5,7 @@
 //! lost than necessary. Of a fisheye it shows at most [`WIDEST`] off the axis: a pinhole spends ever more pixels on
 //! larger angles, and cannot show 90 degrees.
 
-use glam::{DVec2, Vec4};
+use glam::DVec2;
 use nightsplat_core::camera::Lens;
 use rayon::prelude::*;
 
@@ -124,7 +124,7 @@ fn fits(lens: &Lens, zoom: f64, widest: f64) -> bool {
 /// negative light.
 struct Taps {
     columns: [usize; 4],
-    across: Vec4,
+    across: [f32; 4],
     /// Start indices of the four rows.
     rows: [usize; 4],
     down: [f32; 4],
@@ -134,38 +134,50 @@ impl Taps {
     fn at([x, y]: [f32; 2], width: usize, height: usize) -> Self {
         let (columns, across) = cubic(x, width);
         let (rows, down) = cubic(y, height);
-        Self { columns, across: across.into(), rows: rows.map(|row| row * width), down }
+        Self { columns, across, rows: rows.map(|row| row * width), down }
     }
 
-    /// All planes at once: one plane's sum waits for each addition, three keep the processor busy.
+    /// All planes at once: one plane's sum waits for each addition, three keep the processor busy. The least and the
+    /// largest value are of each column first.
     fn sample<const N: usize>(&self, planes: [&[f32]; N]) -> [f32; N] {
-        let mut sum = [0.0; N];
-        let mut range = [[Vec4::INFINITY, Vec4::NEG_INFINITY]; N];
+        let (mut sum, mut low, mut high) =
+            ([0.0; N], [[f32::INFINITY; 4]; N], [[f32::NEG_INFINITY; 4]; N]);
         for (row, down) in self.rows.iter().zip(self.down) {
-            let weights = down * self.across;
             for plane in 0..N {
                 let values = self.columns_of(&planes[plane][*row..]);
-                for product in (weights * values).to_array() {
-                    sum[plane] += product;
+                for (column, value) in values.into_iter().enumerate() {
+                    sum[plane] += down * self.across[column] * value;
                 }
-                let [low, high] = range[plane];
-                range[plane] = [values.min(low), values.max(high)];
+                low[plane] =
+                    std::array::from_fn(|column| least(values[column], low[plane][column]));
+                high[plane] =
+                    std::array::from_fn(|column| most(values[column], high[plane][column]));
             }
         }
         std::array::from_fn(|plane| {
-            let [low, high] = range[plane];
-            sum[plane].max(low.min_element()).min(high.max_element())
+            let low = low[plane].into_iter().fold(f32::INFINITY, least);
+            let high = high[plane].into_iter().fold(f32::NEG_INFINITY, most);
+            sum[plane].max(low).min(high)
         })
     }
 
-    fn columns_of(&self, row: &[f32]) -> Vec4 {
+    fn columns_of(&self, row: &[f32]) -> [f32; 4] {
         let [first, .., last] = self.columns;
-        if last == first + 3 {
-            Vec4::from_slice(&row[first..=last])
-        } else {
-            self.columns.map(|column| row[column]).into()
+        match row.get(first..=last) {
+            Some(&[a, b, c, d]) => [a, b, c, d],
+            _ => self.columns.map(|column| row[column]),
         }
     }
+}
+
+/// Not `min`, which first checks for NaN: the second value, unless the first is less.
+fn least(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
+/// The second value, unless the first is greater.
+fn most(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
 }
 
 /// Indices and weights of the four pixels around a position along one axis.
