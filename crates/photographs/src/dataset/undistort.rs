@@ -5,7 +5,7 @@
 //! lost than necessary. Of a fisheye it shows at most [`WIDEST`] off the axis: a pinhole spends ever more pixels on
 //! larger angles, and cannot show 90 degrees.
 
-use glam::DVec2;
+use glam::{DVec2, Vec4};
 use nightsplat_core::camera::Lens;
 use rayon::prelude::*;
 
@@ -140,44 +140,34 @@ impl Taps {
     /// All planes at once: one plane's sum waits for each addition, three keep the processor busy. The least and the
     /// largest value are of each column first.
     fn sample<const N: usize>(&self, planes: [&[f32]; N]) -> [f32; N] {
-        let (mut sum, mut low, mut high) =
-            ([0.0; N], [[f32::INFINITY; 4]; N], [[f32::NEG_INFINITY; 4]; N]);
+        let mut sum = [0.0; N];
+        let mut range = [[Vec4::INFINITY, Vec4::NEG_INFINITY]; N];
         for (row, down) in self.rows.iter().zip(self.down) {
+            let weights = down * Vec4::from(self.across);
             for plane in 0..N {
                 let values = self.columns_of(&planes[plane][*row..]);
-                for (column, value) in values.into_iter().enumerate() {
-                    sum[plane] += down * self.across[column] * value;
+                for product in (weights * values).to_array() {
+                    sum[plane] += product;
                 }
-                low[plane] =
-                    std::array::from_fn(|column| least(values[column], low[plane][column]));
-                high[plane] =
-                    std::array::from_fn(|column| most(values[column], high[plane][column]));
+                // Not `min` and `max`, which treat a NaN as the processor does.
+                let [low, high] = range[plane];
+                let low = Vec4::select(values.cmplt(low), values, low);
+                range[plane] = [low, Vec4::select(values.cmpgt(high), values, high)];
             }
         }
         std::array::from_fn(|plane| {
-            let low = low[plane].into_iter().fold(f32::INFINITY, least);
-            let high = high[plane].into_iter().fold(f32::NEG_INFINITY, most);
-            sum[plane].max(low).min(high)
+            let [low, high] = range[plane];
+            sum[plane].max(low.min_element()).min(high.max_element())
         })
     }
 
-    fn columns_of(&self, row: &[f32]) -> [f32; 4] {
+    fn columns_of(&self, row: &[f32]) -> Vec4 {
         let [first, .., last] = self.columns;
         match row.get(first..=last) {
-            Some(&[a, b, c, d]) => [a, b, c, d],
-            _ => self.columns.map(|column| row[column]),
+            Some(four @ [_, _, _, _]) => Vec4::from_slice(four),
+            _ => self.columns.map(|column| row[column]).into(),
         }
     }
-}
-
-/// Not `min`, which first checks for NaN: the second value, unless the first is less.
-fn least(a: f32, b: f32) -> f32 {
-    if a < b { a } else { b }
-}
-
-/// The second value, unless the first is greater.
-fn most(a: f32, b: f32) -> f32 {
-    if a > b { a } else { b }
 }
 
 /// Indices and weights of the four pixels around a position along one axis.
