@@ -250,7 +250,7 @@ impl TermInputs<'_> {
 
 /// A term of the render.
 pub trait LossTerm: std::fmt::Debug + Send {
-    /// Compiles, ahead of [`Self::prepare`], what that compiles for views of some sizes or others.
+    /// Compiles every kernel that [`Self::prepare`] would compile only for views that need it.
     fn compile(&mut self) -> Result<()> {
         Ok(())
     }

@@ -72,7 +72,7 @@ impl PseudoGt {
         })
     }
 
-    /// Compiles the kernel for photographs of the host.
+    /// Compiles the kernel of [`Self::map`] ahead of its first use.
     pub(crate) fn compile(&self) -> Result<()> {
         self.pipeline(32, true).map(drop)
     }

@@ -96,7 +96,7 @@ impl Linear {
                 let code = value * levels;
                 (code - rounded(code)).abs() <= 2e-3 && (0.0..=levels).contains(&code)
             };
-            // Without an end in its middle, a part is tested many values at a time.
+            // Without an early exit, the compiler tests the values of a chunk in vectors.
             let are_whole = |values: &[f32]| values.iter().fold(true, |all, x| all & is_whole(x));
             image.data.chunks(1024).all(are_whole)
         });
@@ -112,9 +112,9 @@ impl Linear {
     }
 }
 
-/// The nearest whole number of a magnitude below 2^22; `round` is a call on most processors.
+/// The nearest whole number, of two the even one, below 2^22; `round` is a function call on many processors.
 fn rounded(value: f32) -> f32 {
-    /// Between whole numbers alone.
+    /// In its octave, floats are whole numbers: the sum is rounded to one.
     const WHOLE: f32 = 1.5 * (1 << 23) as f32;
     (value + WHOLE) - WHOLE
 }
