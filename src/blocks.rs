@@ -19,12 +19,10 @@ mod budget;
 mod draft;
 mod folder;
 mod join;
-mod partition;
 mod plan;
 mod planning;
 mod speed;
 mod task;
-mod visibility;
 
 pub(crate) use join::join;
 pub(crate) use plan::{BlockPlan, MAX_ROUNDS, PlanRow, Request};

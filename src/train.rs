@@ -17,6 +17,7 @@ mod exposures;
 mod first_gaussians;
 mod gaussians;
 mod growth;
+mod kept;
 mod lamp;
 mod layers;
 mod masks;

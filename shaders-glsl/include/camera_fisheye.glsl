@@ -39,7 +39,7 @@ float angle_off_axis(float r, float z) {
 }
 
 float fisheye_depth(vec3 point, Camera camera) {
-    // Written so that a NaN is not seen.
+    // Written so that a NaN is not seen; for no z below 0 is the angle known to be right.
     bool is_seen = point.z > 0.0 && angle_off_axis(length(point.xy), point.z) < camera.largest_angle;
     return is_seen ? length(point) : -1.0;
 }

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use super::scene::BenchScene;
 use super::{Bench, median, stages, total};
 use crate::Result;
-use crate::gpu::{Buffer, Resources, Sorting, Tile, TunedTile};
+use crate::gpu::{Buffer, Properties, Resources, Sorting, Tile, TunedTile};
 use crate::splats::batches::GradientKind;
 use crate::splats::device::{DeviceGaussians, Layout, Upload};
 use crate::splats::render::{
@@ -24,6 +24,9 @@ const SIZES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8
 /// ends one loop over all lanes and begins another.
 const SUBGROUPS: [u32; 3] = [1, 2, 4];
 const SHARED_PIXELS: u32 = 256;
+
+/// Lengths of segments, tried with the fastest tile. A processor has one segment.
+const SEGMENTS: [u32; 5] = [0, 64, 128, 512, 1024];
 
 /// Sorts; processors have the first.
 const SORTS: [Sorting; 2] = [Sorting::Whole, Sorting::Tiles];
@@ -69,14 +72,23 @@ pub(crate) struct TileTimings {
 impl TileTimings {
     /// Measures every case, and stores the fastest tiles.
     pub(crate) fn measure(bench: &Bench, sizes: &[[u32; 2]]) -> Result<Self> {
-        let mut cases = vec![];
+        let device = bench.gpu.properties();
+        let (mut cases, mut fastest) = (vec![], vec![]);
         for features in FEATURES {
-            for &size in sizes {
-                cases.push(Case::measure(bench, &bench.source.scene(size, features))?);
-            }
+            let measured = |choices: &[(Tile, Sorting)]| {
+                let sizes = sizes.iter().filter(|_| !choices.is_empty());
+                let scenes = sizes.map(|&size| bench.source.scene(size, features));
+                scenes
+                    .map(|scene| Case::measure(bench, &scene, choices))
+                    .collect::<Result<Vec<_>>>()
+            };
+            let of_tiles = measured(&choices(device))?;
+            let Some(choice) = fastest_of(&of_tiles) else { continue };
+            let of_segments = measured(&in_segments(device, choice))?;
+            let (tile, sorting) = fastest_of(&of_segments).unwrap_or(choice);
+            fastest.push(TunedTile { channels: features.channels(), tile, sorting });
+            cases.extend(of_tiles.into_iter().chain(of_segments));
         }
-        let fastest: Vec<_> =
-            FEATURES.iter().filter_map(|f| fastest(&cases, f.channels())).collect();
         let file = bench.gpu.keep_tuned_tiles(&fastest)?;
         Ok(Self { cases, fastest, file })
     }
@@ -103,39 +115,47 @@ impl TileTimings {
 
 /// The tile and the sort with the least sum over sizes of their time relative to the fastest at that size. A tile whose
 /// kernels spill is taken only where all do: the timed scene leaves caches to spills that a larger one does not.
-fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
-    let cases = || cases.iter().filter(|case| case.channels == channels);
-    let choices = cases().next()?.tiles.iter().map(TileTiming::choice);
+fn fastest_of(cases: &[Case]) -> Option<(Tile, Sorting)> {
+    let choices = cases.first()?.tiles.iter().map(TileTiming::choice);
     let cost = |choice: (Tile, Sorting)| {
         let relative = |case: &Case| {
             let timing = case.candidates().find(|measured| measured.choice() == choice);
             timing.map_or(f64::INFINITY, |timing| timing.rasteriser() / case.least())
         };
-        cases().map(relative).sum::<f64>()
+        cases.iter().map(relative).sum::<f64>()
     };
-    let (tile, sorting) = choices.min_by(|&a, &b| cost(a).total_cmp(&cost(b)))?;
-    Some(TunedTile { channels, tile, sorting })
+    choices.min_by(|&a, &b| cost(a).total_cmp(&cost(b)))
+}
+
+/// Every tile with every sort that a device tries.
+fn choices(device: &Properties) -> Vec<(Tile, Sorting)> {
+    let subgroups = if device.is_cpu { &SUBGROUPS[..1] } else { &SUBGROUPS };
+    let sharing =
+        |size: [u32; 2]| subgroups.iter().map(move |&subgroups| Tile { subgroups, ..size.into() });
+    let is_tried = |tile: &Tile| {
+        let is_large = tile.subgroups == 1 || tile.size[0] * tile.size[1] >= SHARED_PIXELS;
+        is_large && device.suits_tile(*tile)
+    };
+    // A processor sorts tiles by themselves with one subgroup each, whose every step is a loop of its own.
+    let sorts = if device.is_cpu { &SORTS[..1] } else { &SORTS };
+    let tiles = SIZES.into_iter().flat_map(sharing).filter(is_tried);
+    tiles.flat_map(|tile| sorts.iter().map(move |&sorting| (tile, sorting))).collect()
+}
+
+/// A choice with every length of segments that a device tries.
+fn in_segments(device: &Properties, (tile, sorting): (Tile, Sorting)) -> Vec<(Tile, Sorting)> {
+    let lengths = if device.is_cpu { &[][..] } else { &SEGMENTS };
+    let tiles = lengths.iter().map(|&segment| Tile { segment: Some(segment), ..tile });
+    tiles.filter(|tile| device.suits_tile(*tile)).map(|tile| (tile, sorting)).collect()
 }
 
 impl Case {
-    fn measure(bench: &Bench, scene: &BenchScene) -> Result<Self> {
+    fn measure(bench: &Bench, scene: &BenchScene, choices: &[(Tile, Sorting)]) -> Result<Self> {
         let BenchScene { camera, gaussians, .. } = scene;
         let gpu = &bench.gpu;
         let on_device = gaussians.upload(gpu)?;
-        let subgroups = if gpu.properties().is_cpu { &SUBGROUPS[..1] } else { &SUBGROUPS };
-        let sharing = |size| subgroups.iter().map(move |&subgroups| Tile { size, subgroups });
-        let is_tried = |tile: &Tile| {
-            let pixels = tile.size[0] * tile.size[1];
-            let is_large = tile.subgroups == 1 || pixels >= SHARED_PIXELS;
-            is_large && gpu.properties().suits_tile(*tile)
-        };
-        let tiles = SIZES.into_iter().flat_map(sharing).filter(is_tried);
-        // A processor sorts tiles by themselves with one subgroup each, whose every step is a loop of its own.
-        let sorts = if gpu.properties().is_cpu { &SORTS[..1] } else { &SORTS };
-        let choices: Vec<_> =
-            tiles.flat_map(|tile| sorts.iter().map(move |&sorting| (tile, sorting))).collect();
         // Compiling takes longer than everything else.
-        let compiled = choices.into_par_iter().map(|(tile, sorting)| {
+        let compiled = choices.par_iter().map(|&(tile, sorting)| {
             let defaults = scene.render_settings();
             let settings = RenderSettings { tile: Some(tile), sorting: Some(sorting), ..defaults };
             let renderer = Renderer::with_gradients(gpu, settings, GradientKind::All, 0)?;
@@ -356,12 +376,22 @@ mod tests {
             case(3, &[(small, 30.0, 0.0), (large, 20.0, 0.0), (wrong, 10.0, f32::NAN)]),
             case(11, &[(small, 5.0, 0.0), (large, 6.0, 0.0)]),
         ];
-        let tuned = |channels, tile: [u32; 2]| {
-            let tile = tile.into();
-            TunedTile { channels, tile, sorting: Sorting::Whole }
+        let chosen = |tile: [u32; 2]| Some((tile.into(), Sorting::Whole));
+        assert_eq!(fastest_of(&cases[..2]), chosen(large));
+        assert_eq!(fastest_of(&cases[2..]), chosen(small));
+    }
+
+    #[test]
+    fn a_gpu_tries_every_length_of_segments_of_whole_subgroups() {
+        let segments = |subgroup_size, is_cpu| {
+            let device = Properties { subgroup_size, is_cpu, ..Properties::of_a_test() };
+            let choices = in_segments(&device, ([16, 16].into(), Sorting::Tiles));
+            assert!(choices.iter().all(|&(_, sorting)| sorting == Sorting::Tiles));
+            choices.iter().map(|(tile, _)| tile.segment.unwrap()).collect::<Vec<_>>()
         };
-        assert_eq!(fastest(&cases, 3), Some(tuned(3, large)));
-        assert_eq!(fastest(&cases, 11), Some(tuned(11, small)));
+        assert_eq!(segments(32, false), SEGMENTS);
+        assert_eq!(segments(128, false), [0, 128, 512, 1024]);
+        assert!(segments(8, true).is_empty());
     }
 
     #[test]
@@ -374,7 +404,7 @@ mod tests {
                 measured.resources = Some([spills(0.0), spills(value)]);
             }
             let text = tuned.as_text();
-            (fastest(&[tuned], 3).unwrap().tile, text)
+            (fastest_of(&[tuned]).unwrap().0, text)
         };
         assert_eq!(chosen([0.0, 0.0]).0, large.into());
         let (tile, text) = chosen([0.0, 4.0]);

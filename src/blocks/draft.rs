@@ -6,10 +6,10 @@ use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::dataset::block::{Block, Cell};
 
 use super::budget::Budget;
-use super::partition::BlockCells;
 use super::plan::{COARSE, PlanFile, PlanRow, Request};
-use super::visibility::Visibility;
 use crate::train::TrainConfig;
+use nightsplat_photographs::dataset::block::partition::BlockCells;
+use nightsplat_photographs::dataset::block::visibility::Visibility;
 
 /// The share of the steps that the coarse model takes.
 const COARSE_STEPS: f64 = 0.125;

@@ -8,11 +8,13 @@ use nightsplat_photographs::scene_tone::SceneTone;
 
 use super::budget::Budget;
 use super::draft::{Draft, block_id};
-use super::partition::{BlockCells, Until, WeightedPoint, partition};
 use super::plan::{BlockPlan, LAW, PlanFile, Request, VERSION};
-use super::visibility::Visibility;
 use crate::train::{PlannedRun, StopConfig, TrainConfig};
 use crate::{Error, Result};
+use nightsplat_photographs::dataset::block::partition::{
+    BlockCells, Until, WeightedPoint, partition,
+};
+use nightsplat_photographs::dataset::block::visibility::Visibility;
 
 /// Blocks whose mean share of the views is larger do not pay.
 const MOST_SHARED: f64 = 0.75;

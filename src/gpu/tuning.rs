@@ -14,8 +14,8 @@ use crate::{Error, Result};
 /// The variable with the path of another file, or `off`: no file.
 pub const TUNE_VARIABLE: &str = "NIGHTSPLAT_TUNE";
 
-/// The pixels that a workgroup of the rasteriser renders. In files: two numbers, or three where several subgroups share
-/// it.
+/// The pixels that a workgroup of the rasteriser renders, and how. In files: two to four numbers, in the order of the
+/// fields; without the last ones, a subgroup has the tile to itself, and the device decides on segments.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<u32>", into = "Vec<u32>")]
 pub struct Tile {
@@ -23,6 +23,9 @@ pub struct Tile {
     pub size: [u32; 2],
     /// The number of subgroups, each of which has a part, one above the other: 1, 2 or 4.
     pub subgroups: u32,
+    /// The splats of a segment of a tile's run, which the backward pass blends side by side: a multiple of the device's
+    /// lanes, or 0 for one segment. `None`: as suits the device.
+    pub segment: Option<u32>,
 }
 
 impl Tile {
@@ -37,7 +40,7 @@ impl Tile {
 /// A tile of one subgroup.
 impl From<[u32; 2]> for Tile {
     fn from(size: [u32; 2]) -> Self {
-        Self { size, subgroups: 1 }
+        Self { size, subgroups: 1, segment: None }
     }
 }
 
@@ -47,21 +50,28 @@ impl TryFrom<Vec<u32>> for Tile {
     fn try_from(numbers: Vec<u32>) -> Result<Self, String> {
         match numbers[..] {
             [width, height] => Ok([width, height].into()),
-            [width, height, subgroups] => Ok(Self { size: [width, height], subgroups }),
-            _ => Err("a tile is its width and height in pixels, and how many subgroups share it"
+            [width, height, subgroups] => Ok(Self { subgroups, ..[width, height].into() }),
+            [width, height, subgroups, segment] => {
+                Ok(Self { size: [width, height], subgroups, segment: Some(segment) })
+            }
+            _ => Err("a tile is its width and height in pixels, how many subgroups share it, and the splats of a \
+                      segment"
                 .to_owned()),
         }
     }
 }
 
 impl From<Tile> for Vec<u32> {
-    fn from(Tile { size: [width, height], subgroups }: Tile) -> Self {
-        let numbers = [width, height, subgroups];
-        numbers[..if subgroups == 1 { 2 } else { 3 }].to_vec()
+    fn from(Tile { size: [width, height], subgroups, segment }: Tile) -> Self {
+        match segment {
+            Some(segment) => vec![width, height, subgroups, segment],
+            None if subgroups == 1 => vec![width, height],
+            None => vec![width, height, subgroups],
+        }
     }
 }
 
-/// `16x8`, or `16x16x4` of four subgroups.
+/// `16x8`, `16x16x4` of four subgroups, or `16x16x4x128` in segments of 128 splats.
 impl fmt::Display for Tile {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         let numbers: Vec<_> = Vec::from(*self).iter().map(u32::to_string).collect();
@@ -113,8 +123,8 @@ struct Tuning {
 
 impl Properties {
     /// Whether subgroups can share such tiles: each part has 1 to 32 rows of lanes, lanes fill rows of pixels or the
-    /// reverse, all lanes fit a workgroup, and the subgroups stay converged while others leave their loops. A software
-    /// device runs one after the other.
+    /// reverse, all lanes fit a workgroup, the subgroups stay converged while others leave their loops, and a segment
+    /// has whole subgroups of splats. A software device runs one subgroup after the other.
     #[doc(hidden)]
     pub fn suits_tile(&self, tile: impl Into<Tile>) -> bool {
         let tile = tile.into();
@@ -130,6 +140,7 @@ impl Properties {
                 && (1..=32).contains(&(pixels / lanes))
                 && is_workgroup
                 && (tile.subgroups == 1 || keeps_subgroups)
+                && u64::from(tile.segment.unwrap_or(0)).is_multiple_of(lanes)
         })
     }
 }
@@ -233,6 +244,10 @@ mod tests {
         Properties::of_a_test()
     }
 
+    fn shared(size: [u32; 2], subgroups: u32) -> Tile {
+        Tile { subgroups, ..size.into() }
+    }
+
     #[test]
     fn a_tile_has_1_to_32_rows_of_lanes() {
         let suits = |size: [u32; 2]| properties().suits_tile(size);
@@ -246,27 +261,32 @@ mod tests {
 
     #[test]
     fn subgroups_share_a_tile_in_equal_parts() {
-        let suits = |size, subgroups| properties().suits_tile(Tile { size, subgroups });
+        let suits = |size, subgroups| properties().suits_tile(shared(size, subgroups));
         assert!(suits([16, 16], 2) && suits([16, 16], 4) && suits([16, 32], 2) && suits([8, 2], 2));
         assert!(!suits([16, 6], 4) && !suits([4, 4], 4) && !suits([16, 128], 4));
         assert!(!suits([16, 16], 0) && !suits([15, 24], 3) && !suits([16, 16], 8));
         let diverging = Properties { has_uniform_subgroup_control_flow: false, ..properties() };
-        assert!(!diverging.suits_tile(Tile { size: [16, 16], subgroups: 2 }));
+        assert!(!diverging.suits_tile(shared([16, 16], 2)));
         assert!(diverging.suits_tile([16, 16]));
         let wide = Properties { subgroup_size: 128, ..properties() };
-        assert!(wide.suits_tile(Tile { size: [16, 16], subgroups: 2 }));
-        assert!(!wide.suits_tile(Tile { size: [32, 16], subgroups: 4 }), "512 lanes");
+        assert!(wide.suits_tile(shared([16, 16], 2)));
+        assert!(!wide.suits_tile(shared([32, 16], 4)), "512 lanes");
+        let in_segments =
+            |segment| properties().suits_tile(Tile { segment: Some(segment), ..[16, 16].into() });
+        assert!(in_segments(0) && in_segments(64) && !in_segments(60));
     }
 
     #[test]
     fn a_tile_is_read_as_it_is_written() {
-        for (tile, text) in
-            [(Tile::from([16, 8]), "[16,8]"), (Tile { size: [16, 16], subgroups: 4 }, "[16,16,4]")]
-        {
+        for (tile, text) in [
+            (Tile::from([16, 8]), "[16,8]"),
+            (shared([16, 16], 4), "[16,16,4]"),
+            (Tile { segment: Some(0), ..[16, 8].into() }, "[16,8,1,0]"),
+        ] {
             assert_eq!(serde_json::to_string(&tile).unwrap(), text);
             assert_eq!(serde_json::from_str::<Tile>(text).unwrap(), tile);
         }
-        assert_eq!(Tile { size: [16, 16], subgroups: 4 }.to_string(), "16x16x4");
+        assert_eq!(shared([16, 16], 4).to_string(), "16x16x4");
         assert!(serde_json::from_str::<Tile>("[16]").is_err());
     }
 

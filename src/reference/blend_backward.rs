@@ -49,7 +49,8 @@ pub fn blend_pixel_backward(
 /// Whether a channel moves and shapes the splats.
 fn shapes(constants: &Constants, channel: usize) -> bool {
     let Constants { channels, shaping_channels, view_depths, .. } = *constants;
-    channel < shaping_channels as usize || channel >= (channels - view_depths) as usize
+    let is_shaping = channel < shaping_channels as usize;
+    shaping_channels > 0 && (is_shaping || channel >= (channels - view_depths) as usize)
 }
 
 /// A pixel of a tile: its centre, its render, and the gradient of that.

@@ -23,8 +23,11 @@ mod eyes;
 mod gradients;
 mod images;
 mod instances;
+#[cfg(feature = "train")]
+mod kept;
 mod lamp;
 mod limits;
+mod lists;
 mod motion;
 mod picks;
 mod pipelines;
@@ -56,6 +59,7 @@ use eyes::DepthOrder;
 pub(crate) use gradients::ViewGradients;
 pub use instances::Instance;
 pub(crate) use lamp::DeviceLamp;
+use lists::Lists;
 use motion::MotionVectors;
 use picks::Picks;
 pub use picks::{Pick, PickedSplat};
@@ -150,7 +154,7 @@ impl Renderer {
     /// The number of intersections of the last render; waits for it.
     #[doc(hidden)]
     pub fn intersections(&self) -> Result<u32> {
-        Ok(self.gpu.read(&self.frame.counts)?[0])
+        Ok(self.gpu.read(&self.frame.lists.counts)?[0])
     }
 
     /// The settings that it was made with.
@@ -269,9 +273,12 @@ impl Renderer {
         depths: Option<DepthChannel>,
         capacity: Option<u32>,
     ) -> Result<()> {
-        pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
-        self.record_bins(pass, gaussian_count, view, capacity)?;
+        if view.lists.is_none() {
+            pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
+            self.record_bins(pass, gaussian_count, view, capacity)?;
+        }
         let frame = &mut self.frame;
+        let lists = view.lists.unwrap_or(&frame.lists);
         let with_depths = self.blend_depths.as_ref().filter(|_| depths.is_some());
         pass.dispatch(
             with_depths.unwrap_or(&self.blend_forward),
@@ -284,14 +291,14 @@ impl Renderer {
                 background: options.background,
             },
             blend_forward::Buffers {
-                counts: frame.counts.slice(),
-                sorted_intersections: frame.intersection_ids.slice(),
-                gaussian_ids: frame.gaussian_ids.slice(),
+                counts: lists.counts.slice(),
+                sorted_intersections: lists.intersection_ids.slice(),
+                gaussian_ids: lists.gaussian_ids.slice(),
                 splats: frame.splats.slice(),
                 colors: frame.colors.slice(),
                 render: frame.render.slice_mut(),
                 transmittances: frame.transmittances.slice_mut(),
-                sorted_tiles: frame.tiles.slice(),
+                sorted_tiles: lists.tiles.slice(),
                 tile_ranges: frame.tile_ranges.slice_mut(),
                 status: frame.status.slice_mut(),
                 limits: self.limits.slice(),
@@ -338,21 +345,22 @@ impl Renderer {
         let color_floats = color_floats(view.channels);
         let first = self.context_count();
         let (frame, tile_count) = (&mut self.frame, view.tile_count());
-        let further_segments = frame.segments.blocks(frame.intersection_capacity());
+        let lists = view.lists.unwrap_or(&frame.lists);
+        let further_segments = frame.segments.blocks(lists.tiles.len() as u32);
         pass.dispatch(
             blend_backward,
             &blend_backward::Params { size: view.size, tile_columns: view.tiles.x, tile_count },
             blend_backward::Buffers {
                 tile_ranges: frame.tile_ranges.slice(),
-                sorted_intersections: frame.intersection_ids.slice(),
-                gaussian_ids: frame.gaussian_ids.slice(),
+                sorted_intersections: lists.intersection_ids.slice(),
+                gaussian_ids: lists.gaussian_ids.slice(),
                 splats: frame.splats.slice(),
                 colors: frame.colors.slice(),
                 render: frame.render.slice(),
                 d_render: d_render.slice(),
                 gradient_records: frame.gradient_records.slice_mut(),
-                counts: frame.counts.slice(),
-                sorted_tiles: frame.tiles.slice(),
+                counts: lists.counts.slice(),
+                sorted_tiles: lists.tiles.slice(),
                 segment_states: frame.segment_states.slice(),
             },
             Threads::Workgroups([tile_count.saturating_add(further_segments), 1, 1]),
@@ -376,7 +384,7 @@ impl Renderer {
                     splats: rendered.rows(&frame.splats, 1)?,
                     colors: rendered.rows(&frame.colors, color_floats)?,
                     tile_counts: rendered.rows(&frame.tile_counts, 1)?,
-                    intersection_ranges: rendered.rows(&frame.intersection_ranges, 1)?,
+                    intersection_ranges: rendered.rows(&lists.intersection_ranges, 1)?,
                     gradient_records: frame.gradient_records.slice(),
                     status: frame.status.slice_mut(),
                     gradients: batch.planes_mut(&mut *gradients.parameters)?,
@@ -438,7 +446,7 @@ impl Renderer {
         view_depths: bool,
         order: DepthOrder,
     ) -> Result<KernelView<'a>> {
-        let Viewpoint { patch, on_device } = viewpoint;
+        let &Viewpoint { ref patch, on_device, lists } = viewpoint;
         let tiles = self.tiles(patch.size);
         let channels = self.settings.channels() + usize::from(view_depths);
         if channels * patch.pixel_count() > self.frame.render.len()
@@ -457,7 +465,17 @@ impl Renderer {
         let (cameras, camera_index) = on_device.unzip();
         let camera_index = camera_index.unwrap_or_default();
         let (size, half_view) = (patch.size, patch.half_view());
-        Ok(KernelView { kind, order, channels, cameras, camera_index, size, half_view, tiles })
+        Ok(KernelView {
+            kind,
+            order,
+            channels,
+            cameras,
+            camera_index,
+            size,
+            half_view,
+            tiles,
+            lists,
+        })
     }
 }
 
@@ -473,6 +491,8 @@ struct KernelView<'a> {
     size: UVec2,
     half_view: Vec2,
     tiles: UVec2,
+    /// Its sorted intersections; `None`: they are sorted into the renderer's.
+    lists: Option<&'a Lists>,
 }
 
 impl KernelView<'_> {

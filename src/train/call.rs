@@ -61,6 +61,11 @@ impl Call {
         *self = Self { budget, longest, scores, ..Self::default() };
     }
 
+    /// Whether its time is not over.
+    pub(super) fn has_time(&self) -> bool {
+        self.budget.is_none_or(|budget| self.begin.elapsed() < budget)
+    }
+
     /// What these scores were for is decided: the next ones are of another model.
     pub(super) fn decided(&mut self, what: Scored) {
         self.scores.remove(&what);

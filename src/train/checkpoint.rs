@@ -211,6 +211,7 @@ impl Trainer {
             self.model.gaussians = fresh;
             return Err(error);
         }
+        self.supervision.views.viewpoints.forget_lists();
         self.supervision.views.set_left_out(&header.left_out);
         (self.clock.step, self.clock.decisions, self.model.best) =
             (header.step, header.decisions, best);

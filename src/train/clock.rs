@@ -106,7 +106,7 @@ impl RunClock {
         let rates = self.config.schedule.learning_rates(step, extent);
         let mut rates = rates.scaled(self.cooldown_factor(step));
         for spec in &ATTRIBUTES {
-            if self.config.freeze.as_ref().is_some_and(|freeze| freeze.has(spec.attribute)) {
+            if self.config.freezes(spec.attribute) {
                 rates[spec.attribute] = 0.0;
             }
         }

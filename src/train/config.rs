@@ -182,9 +182,10 @@ pub struct TrainConfig {
     tensorboard: bool = false => Rule::Flag, "--tensorboard";
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu.
     device: String = String::new(), "the best" => Rule::Text("a device", |_| true), "--device DEVICE";
-    /// The tile that a workgroup renders: width and height in pixels and, if several subgroups share it, their number.
+    /// The tile that a workgroup renders: width and height in pixels, the number of subgroups that share it, and the
+    /// splats of a segment of the backward pass.
     tile: Option<Tile> = None, "the fastest known on the device; recorded"
-        => Rule::List(2, 3, &Rule::Whole(0, u32::MAX as u64));
+        => Rule::List(2, 4, &Rule::Whole(0, u32::MAX as u64));
     /// Near plane, in units of the scene extent: the distance of the cameras from their centre, rounded to a power of
     /// two.
     near: f64 = 0.1 => Rule::from_to(1e-6, 1.0), "--near N";
@@ -446,6 +447,16 @@ impl TrainConfig {
     /// Whether the shape or the place of the Gaussians is frozen.
     pub(super) fn freezes_geometry(&self) -> bool {
         self.freeze.as_ref().is_some_and(Freeze::has_geometry)
+    }
+
+    /// Whether an attribute is frozen.
+    pub(super) fn freezes(&self, attribute: Attribute) -> bool {
+        self.freeze.as_ref().is_some_and(|freeze| freeze.has(attribute))
+    }
+
+    /// Whether means, shapes and opacities are frozen: every view has the same splats in every step.
+    pub(super) fn freezes_splats(&self) -> bool {
+        self.frozen_columns() as usize >= Attribute::Dc.column(0)
     }
 
     /// The columns of the Gaussians' attributes, from the first, that no pass updates.

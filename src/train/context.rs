@@ -1,7 +1,10 @@
 //! The Gaussians that a training starts from: those that it trains, and around a block those that it renders alone.
 
+use std::path::{Path, PathBuf};
+
 use nightsplat_core::camera::Camera;
 use nightsplat_models::gaussians::Gaussians;
+use nightsplat_models::gaussians::ply::parts::{PART, PartFile};
 use nightsplat_models::joined::{MANIFEST, TileManifest};
 use nightsplat_photographs::dataset::Dataset;
 use nightsplat_photographs::dataset::block::{Block, Cell};
@@ -28,10 +31,7 @@ impl Initial {
     /// tiles is read one tile after the other.
     pub(super) fn load(config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
         let Some(path) = &config.init else { return Ok(Self::default()) };
-        let files = match path.join(MANIFEST).is_file() {
-            true => TileManifest::load(path)?.files(),
-            false => vec![path.clone()],
-        };
+        let files = files(path)?;
         let block = Block::at(&dataset.root)?.filter(|block| block.halo != Cell::WORLD);
         let cameras: Vec<Camera> = dataset.train_views().map(|view| view.camera).collect();
         let mut initial = Self::default();
@@ -59,6 +59,23 @@ impl Initial {
             None => Ok(Self::default()),
             Some(_) => Ok(Self { gaussians: None, ..Self::load(config, dataset)? }),
         }
+    }
+}
+
+/// The files of a model: the tiles, if it is in tiles.
+fn files(model: &Path) -> Result<Vec<PathBuf>> {
+    match model.join(MANIFEST).is_file() {
+        true => Ok(TileManifest::load(model)?.files()),
+        false => Ok(vec![model.to_owned()]),
+    }
+}
+
+impl TrainConfig {
+    /// The highest SH degree of the files of [`TrainConfig::init`], as far as their headers tell it.
+    pub(super) fn initial_degree(&self) -> Option<u32> {
+        let files = files(self.init.as_ref()?).ok()?;
+        let degree = |file: &PathBuf| Some(PartFile::open(file, PART).ok()??.shape().sh_degree);
+        files.iter().filter_map(degree).max()
     }
 }
 

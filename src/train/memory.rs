@@ -28,8 +28,8 @@ const STATISTICS: f64 = 8.0;
 const HOST_PLANE_SETS: f64 = 3.0;
 /// The factor of capacity that a growing model allocates.
 const HEADROOM: f64 = 1.5;
-/// The share of memory for activations that could be recomputed.
-const ACTIVATIONS: f64 = 0.25;
+/// The share of memory for what could be recomputed: activations of networks, sorted intersections of views.
+const RECOMPUTABLE: f64 = 0.25;
 
 /// The estimated memory of a training, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -187,8 +187,8 @@ impl Memory {
     }
 }
 
-/// The most bytes for activations that could be recomputed, by the limits of memory and the device's.
-pub(super) fn activation_bytes(gpu: &Gpu, config: &TrainConfig) -> u64 {
+/// The most bytes for a kind of data that could be recomputed, by the limits of memory and the device's.
+pub(super) fn recomputable_bytes(gpu: &Gpu, config: &TrainConfig) -> u64 {
     let device = gpu.properties();
     let most = |CacheSize(bytes): CacheSize| bytes.min(device.memory);
     let vram = config.max_vram.map_or(device.memory, most) as f64;
@@ -196,7 +196,7 @@ pub(super) fn activation_bytes(gpu: &Gpu, config: &TrainConfig) -> u64 {
         Some(CacheSize(ram)) if device.is_cpu => vram.min((ram as f64 - PROGRAM).max(0.0)),
         _ => vram,
     };
-    (ACTIVATIONS * bytes) as u64
+    (RECOMPUTABLE * bytes) as u64
 }
 
 /// The intersections of the first Gaussians in the largest view, for which memory is then reserved.

@@ -5,6 +5,7 @@ use std::thread;
 
 use nightsplat_core::random::Stream;
 use nightsplat_core::watch::Watch;
+use nightsplat_models::attributes::Attribute;
 use nightsplat_models::gaussians::Shape;
 use nightsplat_photographs::dataset::{Dataset, Photograph};
 use nightsplat_photographs::image::PictureFile;
@@ -100,7 +101,7 @@ fn renderer(gpu: &Gpu, config: &TrainConfig) -> Result<Renderer> {
 /// The smoothing floor of the training views, in the frame, if it is on.
 fn floor(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Option<SmoothingFloor>> {
     let (variance, near) = (config.antialiasing.smoothing, config.render_settings().near);
-    if variance == 0.0 {
+    if variance == 0.0 || config.freezes(Attribute::LogScales) {
         return Ok(None);
     }
     let frame = config.frame.unwrap_or_default();

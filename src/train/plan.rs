@@ -418,13 +418,16 @@ fn depth(diagnosis: &Diagnosis) -> PlannedPart {
     PlannedPart { on: maps > 0, why: format!("{maps} of {views} training views have a depth map") }
 }
 
-/// The highest degree whose coefficients have enough views and steps.
+/// The highest degree whose coefficients have enough views and steps, or that of the given model.
 fn sh_degree(scene: &SceneDiagnosis, config: &TrainConfig) -> PlannedNumber {
     let seen = (scene.views_per_point / VIEWS_PER_COEFFICIENT).sqrt() - 1.0;
     let seen = seen.max(0.0) as u32;
     let last = (config.steps as f64 * LATEST_DEGREE) as u64;
     let trained = config.schedule.sh_degree(last, u32::MAX);
     let value = config.sh_degree.min(seen).min(trained);
+    if let Some(given) = config.initial_degree().filter(|given| *given > value) {
+        return PlannedNumber { value: given.into(), why: "that of the given model".to_owned() };
+    }
     let why = if config.sh_degree < seen.min(trained) {
         "the preset's or the configuration's limit".to_owned()
     } else if trained < seen.min(config.sh_degree) {

@@ -79,6 +79,8 @@ impl Trainer {
     /// Trains up to `until`, up to the next step with an action due, or for about half a second.
     pub(super) fn train_steps(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
         self.allocate_sh_degree()?;
+        let (views, call) = (&mut self.supervision.views, &self.clock.submissions.call);
+        self.model.keep_lists(&self.gpu, &self.config, views, call)?;
         let (begin, mut next) = (self.clock.submissions.call.begin, self.clock.step + 1);
         let stage = Stage::begin("training", self.config.steps as usize);
         let until = until.min(self.last_step());

@@ -65,7 +65,7 @@ pub(super) struct Views {
     all: Vec<TrainView>,
     /// The views of each level.
     levels: Vec<Range<usize>>,
-    viewpoints: Viewpoints,
+    pub(super) viewpoints: Viewpoints,
     /// The photographs left out of training.
     left_out: BTreeSet<TrainingPhotograph>,
     cache: Cache,

@@ -53,7 +53,7 @@ fn built_in() -> Tile {
 
 /// A tile that the device supports and that is not the built-in one.
 fn unusual() -> Tile {
-    Tile { size: [16, 16], subgroups: 2 }
+    Tile { subgroups: 2, segment: Some(64), ..[16, 16].into() }
 }
 
 #[test]
@@ -128,7 +128,9 @@ fn a_damaged_file_and_one_of_another_driver_are_ignored_with_one_line() {
 #[test]
 fn an_unsupported_tile_is_refused_with_the_remedy() {
     let workspace = workspace();
-    for tile in ["[3,3]", "[0,8]", "[4096,4096]", "[4294967295,4294967295]", "[16,16,3]"] {
+    for tile in
+        ["[3,3]", "[0,8]", "[4096,4096]", "[4294967295,4294967295]", "[16,16,3]", "[16,16,1,60]"]
+    {
         let train = format!("train @set --out @run --set tile={tile}");
         workspace.refused(&train, 2, &["tiles do not suit", "lanes", "take a tile of"]);
         assert!(!workspace.path("run").exists());

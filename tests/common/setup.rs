@@ -46,8 +46,6 @@ pub(crate) struct Setup {
     pub(crate) camera: camera::Camera,
     pub(crate) settings: RenderSettings,
     pub(crate) options: RenderOptions,
-    /// The splats of a segment of a tile's run; 0: a run has one. `None`: as the device has it.
-    pub(crate) segment: Option<u32>,
     /// Whether gradients are those of a step of Adam, which completes those of the renderer.
     pub(crate) is_trained: bool,
 }
@@ -85,15 +83,8 @@ impl Setup {
         };
         let settings = RenderSettings { shape, ..RenderSettings::default() };
         let options = RenderOptions { sh_degree: shape.sh_degree, background: [0.0, 0.1, 0.2] };
-        let mut setup = Self {
-            count,
-            parameters: vec![],
-            camera,
-            settings,
-            options,
-            segment: None,
-            is_trained: false,
-        };
+        let mut setup =
+            Self { count, parameters: vec![], camera, settings, options, is_trained: false };
         setup.parameters = vec![0.0; setup.planes().float_count()];
         let mut random = Random::new(seed);
         for i in 0..count {
@@ -269,14 +260,10 @@ impl<'a> Rendered<'a> {
     fn new(setup: &'a Setup) -> Self {
         let gaussians = setup.upload();
         let (gpu, settings) = (gpu(), setup.settings);
-        let mut renderer = match setup.segment {
-            None if setup.is_trained => {
-                Renderer::with_gradients(&gpu, settings, GradientKind::Colors, 0)
-            }
-            None => Renderer::new(&gpu, settings),
-            Some(splats) => Renderer::with_segments(&gpu, settings, splats),
-        }
-        .unwrap();
+        let mut renderer = match setup.is_trained {
+            true => Renderer::with_gradients(&gpu, settings, GradientKind::Colors, 0).unwrap(),
+            false => Renderer::new(&gpu, settings).unwrap(),
+        };
         renderer.reserve(setup.count, [&setup.camera]).unwrap();
         Self { setup, gaussians, renderer, render: vec![], transmittances: vec![] }
     }
@@ -385,7 +372,7 @@ pub(crate) fn features(channels: usize) -> Features {
 
 /// A tile of this size, shared by this number of subgroups.
 pub(crate) fn tile_of((size, subgroups): ([u32; 2], u32)) -> Tile {
-    Tile { size, subgroups }
+    Tile { subgroups, ..size.into() }
 }
 
 /// A typical fisheye, with values that f32 represents.

@@ -63,6 +63,17 @@ fn an_unsuitable_initial_model_is_refused_in_one_line_with_file_and_rule() {
 }
 
 #[test]
+fn a_run_too_short_for_the_degree_of_its_initial_model_keeps_it() {
+    let workspace = Workspace::new();
+    ply::save(&Gaussians::zeros(2, 2), workspace.path("degree.ply")).unwrap();
+    workspace.succeed("train @set --out @run --steps 2 --init @degree.ply");
+    let plan = String::from_utf8(workspace.read("run/plan.toml")).unwrap();
+    assert!(plan.contains("that of the given model"), "{plan}");
+    let trained = ply::load(workspace.path("run/model.ply")).unwrap();
+    assert_eq!(trained.shape.sh_degree, 2);
+}
+
+#[test]
 fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
     let workspace = Workspace::new();
     workspace.trained("run", "--steps 40");

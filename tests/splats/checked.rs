@@ -3,7 +3,7 @@
 
 use nightsplat::Error;
 use nightsplat::gpu::testing::{Defect, is_checked, with_defect};
-use nightsplat::gpu::{CheckReport, Sorting};
+use nightsplat::gpu::{CheckReport, Sorting, Tile};
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
 use nightsplat::train::{Background, Part};
 use nightsplat_photographs::tone::Tone;
@@ -237,7 +237,8 @@ fn the_passes_of_long_runs_agree_with_their_references_in_segments() {
         let mut setup = Setup::opaque_above(channels);
         (setup.settings.tile, setup.settings.trains_depth) = (Some(tile), trains_depth);
         let [whole, segments] = [0, 1].map(|segment| {
-            setup.segment = Some(segment * lanes.max(16));
+            let segment = Some(segment * lanes.max(16));
+            setup.settings.tile = Some(Tile { segment, ..tile });
             assert_passes_agree(&setup)
         });
         let largest = whole.parameters.iter().fold(0.0f32, |most, d| most.max(d.abs()));
@@ -264,7 +265,7 @@ fn runs_of_whole_segments_and_of_one_splat_more_or_less_agree_with_their_referen
         }
         assert_eq!(setup.render().renderer.intersections().unwrap(), 2 * count);
         let [whole, segments] = [0, length].map(|segment| {
-            setup.segment = Some(segment);
+            setup.settings.tile = Some(Tile { segment: Some(segment), ..tile_of(([16, 16], 1)) });
             assert_passes_agree(&setup).parameters
         });
         let largest = whole.iter().fold(0.0f32, |most, d| most.max(d.abs()));

@@ -60,7 +60,7 @@ fn errors_of(count: usize) -> [f64; 2] {
         colors[..4 * count].chunks(4).flat_map(|four| &four[..3]).copied().collect();
     let colors = widen(&colors);
     // The view is one tile, so every layer has one slot.
-    let intersection_ids = gpu().read(&frame.intersection_ranges).unwrap();
+    let intersection_ids = gpu().read(&frame.lists.intersection_ranges).unwrap();
     let stored = gpu().read(&frame.gradient_records).unwrap();
     let sums: Vec<f32> = intersection_ids[..count]
         .iter()

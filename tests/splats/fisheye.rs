@@ -115,7 +115,7 @@ fn nothing_is_seen_at_90_degrees_or_behind_or_where_the_polynomial_falls() {
         }
         let mut setup = dots(&camera, &points);
         let mut rendered = setup.render();
-        assert_eq!(gpu().read(&rendered.renderer.frame().counts).unwrap(), [0]);
+        assert_eq!(gpu().read(&rendered.renderer.frame().lists.counts).unwrap(), [0]);
         assert!(rendered.transmittances.iter().all(|&t| t == 1.0));
         let gradients = rendered.backward(&vec![1.0; rendered.render.len()]);
         assert!(gradients.parameters.iter().all(|&g| g == 0.0));
@@ -124,7 +124,7 @@ fn nothing_is_seen_at_90_degrees_or_behind_or_where_the_polynomial_falls() {
         let near = f64::from(setup.settings.near);
         for (distance, is_seen) in [(near * 0.99, false), (near * 1.01, true)] {
             setup = dots(&camera, &[at(60.0, 0.5) / 3.0 * distance]);
-            let count = gpu().read(&setup.render().renderer.frame().counts).unwrap()[0];
+            let count = gpu().read(&setup.render().renderer.frame().lists.counts).unwrap()[0];
             assert_eq!(count > 0, is_seen, "{distance}");
         }
     }

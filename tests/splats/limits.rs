@@ -14,7 +14,7 @@ use nightsplat_core::camera::Patch;
 use crate::blending::tile_runs;
 use crate::common::not_run;
 use crate::common::prelude::*;
-use crate::common::setup::features;
+use crate::common::setup::{features, tile_of};
 
 /// The total and the status after `order_counts` for this much memory.
 fn counted(
@@ -304,7 +304,7 @@ fn splats_per_tile(count: usize) -> Setup {
 fn a_hundred_thousand_splats_on_one_pixel_are_blended_as_in_the_references() {
     let mut setup = splats_per_tile(100_000);
     // If four subgroups share a tile, each also iterates over its parts.
-    let shared = Tile { size: [16, 16], subgroups: 4 };
+    let shared = tile_of(([16, 16], 4));
     for tile in [None, Some(shared).filter(|&tile| gpu().properties().suits_tile(tile))] {
         setup.settings.tile = tile;
         let (_, report) = gpu().checked(|| {
@@ -351,7 +351,7 @@ fn a_tile_that_does_not_suit_the_device_is_refused_in_one_line_and_other_tiles_r
         assert!(message.contains("take a tile") && !message.contains('\n'), "{message}");
     }
     for subgroups in [0, 3, 8] {
-        setup.settings.tile = Some(Tile { size: [lanes, 24], subgroups });
+        setup.settings.tile = Some(tile_of(([lanes, 24], subgroups)));
         let message = Renderer::new(&gpu(), setup.settings).unwrap_err().to_string();
         assert!(message.contains("1, 2 or 4 subgroups") && !message.contains('\n'), "{message}");
     }
@@ -373,8 +373,8 @@ fn narrow_subgroups_of_a_gpu_share_a_tile_where_they_stay_converged() {
         let shape = Shape { sh_degree: 0, features: features(channels) };
         RenderSettings { shape, ..RenderSettings::default() }.tile_on(&gpu).unwrap()
     };
-    assert_eq!(tile(8, true, 3), Tile { size: [16, 16], subgroups: 4 });
-    assert_eq!(tile(8, true, 11), Tile { size: [16, 8], subgroups: 4 });
+    assert_eq!(tile(8, true, 3), tile_of(([16, 16], 4)));
+    assert_eq!(tile(8, true, 11), tile_of(([16, 8], 4)));
     assert_eq!(tile(8, false, 3), Tile::from([8, 8]));
     assert_eq!(tile(8, false, 11), Tile::from([8, 4]));
     assert_eq!(tile(32, false, 11), Tile::from([16, 16]));

@@ -94,7 +94,7 @@ fn gaussians_out_of_range_are_not_rendered() {
     }
     let mut rendered = setup.render();
     assert_shows_nothing(&rendered, &setup);
-    assert_eq!(gpu().read(&rendered.renderer.frame().counts).unwrap(), [0]);
+    assert_eq!(gpu().read(&rendered.renderer.frame().lists.counts).unwrap(), [0]);
     let gradients = rendered.backward(&vec![1.0; rendered.render.len()]);
     assert!(gradients.parameters.iter().all(|&g| g == 0.0));
     assert_eq!(gradients.visit_counts, [Rendered::VISITS_BEFORE; 17]);
@@ -197,9 +197,9 @@ fn needles(count: usize) -> Setup {
 
 /// Every intersection of a render: tile and Gaussian.
 fn intersections(rendered: &Rendered<'_>) -> Vec<(u32, u32)> {
-    let frame = rendered.renderer.frame();
+    let lists = &rendered.renderer.frame().lists;
     let [tiles, intersection_ids, gaussian_ids, counts] =
-        [&frame.tiles, &frame.intersection_ids, &frame.gaussian_ids, &frame.counts]
+        [&lists.tiles, &lists.intersection_ids, &lists.gaussian_ids, &lists.counts]
             .map(|buffer| gpu().read(buffer).unwrap());
     let gaussian_ids =
         intersection_ids[..counts[0] as usize].iter().map(|&slot| gaussian_ids[slot as usize]);
@@ -231,7 +231,8 @@ fn both_sorts_give_the_same_bits() {
         let [whole, tiles] = [Sorting::Whole, Sorting::Tiles].map(|sorting| {
             let mut setup = needles(3000);
             setup.settings.sorting = Some(sorting);
-            setup.segment = segment;
+            let tile = setup.settings.tile_on(&gpu()).unwrap();
+            setup.settings.tile = Some(Tile { segment, ..tile });
             let mut rendered = setup.render();
             let d_render: Vec<f32> = rendered.render.iter().map(|value| value - 0.5).collect();
             let gradients = rendered.backward(&d_render);

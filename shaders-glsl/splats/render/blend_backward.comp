@@ -20,13 +20,22 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //! Where long runs have segments, the first workgroups have the first segment of every tile, the others one for each
 //! block of intersections, and with it at most one further segment.
 
-// This many channels, from the first, move and shape the splats; of the others only the colours learn.
+// This many channels, from the first, move and shape the splats; of the others only the colours learn. 0: so of all,
+// and the moments are zeros.
 layout(constant_id = 8) const uint SHAPING_CHANNELS = 3;
 // 1: so does the last channel, the mean depth z = sum_i z_i w_i / alpha. The gradient of a weight is d_z / alpha (z_i -
 // z): that of a sum of weighted depths with z as its background, whose gradient is d_z / alpha.
 layout(constant_id = 11) const uint VIEW_DEPTHS = 0;
 
-bool shapes(uint channel) { return channel < SHAPING_CHANNELS || channel >= CHANNELS - VIEW_DEPTHS; }
+// A function, as `tile_is_shared`.
+bool any_shapes() {
+    uint channels = SHAPING_CHANNELS;
+    return channels > 0;
+}
+
+bool shapes(uint channel) {
+    return any_shapes() && (channel < SHAPING_CHANNELS || channel >= CHANNELS - VIEW_DEPTHS);
+}
 
 layout(push_constant, scalar) uniform Params { uvec2 size; uint tile_columns; uint tile_count; };
 
@@ -209,6 +218,7 @@ void main() [[subgroup_uniform_control_flow]] {
                         if (!sums_colors_last()) record[RECORD_HEAD + c] += weight * d_pixel[g][c];
                         if (shapes(c)) shade += splat.color[c / 4][c % 4] * d_pixel[g][c];
                     }
+                    if (!any_shapes()) continue;
                     float passed = weight * shade;
                     light[g] -= passed;
                     // At the cap alpha no longer depends on the splat.

@@ -1,7 +1,7 @@
 //! From projected splats to the sorted list of each tile.
 
 use super::buffers::RANKS_PER_PARTITION;
-use super::{KernelView, Renderer};
+use super::{KernelView, Lists, Renderer};
 use crate::Result;
 use crate::gpu::{Gpu, Recorder, Sorting, Threads};
 use crate::kernels::project::DEPTH_BITS;
@@ -91,7 +91,7 @@ impl Renderer {
                 tile_counts: frame.tile_counts.slice(),
                 intersection_offsets: frame.intersection_offsets.slice_mut(),
                 sums: frame.sums.slice_mut(),
-                counts: frame.counts.slice_mut(),
+                counts: frame.lists.counts.slice_mut(),
                 status: frame.status.slice_mut(),
                 arrivals: frame.arrivals.slice_mut(),
             },
@@ -101,16 +101,16 @@ impl Renderer {
             &self.emit,
             &emit::Params { size: view.size, gaussian_count, tile_columns: view.tiles.x },
             emit::Buffers {
-                counts: frame.counts.slice(),
+                counts: frame.lists.counts.slice(),
                 sorted_ids: frame.ids.slice(),
                 tile_counts: frame.tile_counts.slice(),
                 intersection_offsets: frame.intersection_offsets.slice(),
                 sums: frame.sums.slice(),
                 splats: frame.splats.slice(),
-                tiles: frame.tiles.slice_mut(),
-                intersection_ids: frame.intersection_ids.slice_mut(),
-                gaussian_ids: frame.gaussian_ids.slice_mut(),
-                intersection_ranges: frame.intersection_ranges.slice_mut(),
+                tiles: frame.lists.tiles.slice_mut(),
+                intersection_ids: frame.lists.intersection_ids.slice_mut(),
+                gaussian_ids: frame.lists.gaussian_ids.slice_mut(),
+                intersection_ranges: frame.lists.intersection_ranges.slice_mut(),
                 tile_sizes: match sort {
                     Sort::Whole { .. } => frame.no_sizes.slice_mut(),
                     Sort::Tiles(tiles) => tiles.sizes.slice_mut(),
@@ -118,16 +118,15 @@ impl Renderer {
             },
             Threads::Exactly([gaussian_count, 1, 1]),
         )?;
-        let (tiles, intersection_ids) = (&mut frame.tiles, &mut frame.intersection_ids);
+        let Lists { counts, tiles, intersection_ids, gaussian_ids, .. } = &mut frame.lists;
         match sort {
             Sort::Whole { by_tile, .. } => {
-                let intersections = Count { counts: &frame.counts, index: 0 };
+                let intersections = Count { counts, index: 0 };
                 // One value more than there are tiles: padding sorts last.
                 let bits = u32::BITS - tile_count.leading_zeros();
                 by_tile.record(pass, intersections, tiles, intersection_ids, bits)
             }
             Sort::Tiles(sort) => {
-                let (counts, gaussian_ids) = (&frame.counts, &frame.gaussian_ids);
                 let depth_keys = &frame.depth_keys;
                 let unsorted =
                     UnsortedTiles { counts, gaussian_ids, depth_keys, tiles, intersection_ids };

@@ -3,6 +3,7 @@
 use glam::UVec2;
 
 use super::Purpose;
+use super::lists::Lists;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::kernels::splat::RECORD_HEAD;
@@ -70,11 +71,8 @@ pub struct RenderBuffers {
     pub intersection_offsets: Buffer<u32>,
     /// One per partition of ranks.
     pub sums: Buffer<u32>,
-    pub intersection_ranges: Buffer<UVec2>,
     // intersections
-    pub tiles: Buffer<u32>,
-    pub intersection_ids: Buffer<u32>,
-    pub gaussian_ids: Buffer<u32>,
+    pub lists: Lists,
     pub gradient_records: Buffer<f32>,
     /// The pixels of each tile before the segments of its run after the first.
     pub segment_states: Buffer<f32>,
@@ -87,7 +85,6 @@ pub struct RenderBuffers {
     /// As that camera sees them.
     pub instances: Buffer<InstanceView>,
     // single numbers
-    pub counts: Buffer<u32>,
     pub status: Buffer<u32>,
     /// Workgroups of `order_counts` that are done; 0 between renders.
     pub arrivals: Buffer<u32>,
@@ -115,10 +112,7 @@ impl RenderBuffers {
             tile_counts: gpu.uninit("tile_counts", 0)?,
             intersection_offsets: gpu.uninit("intersection_offsets", 0)?,
             sums: gpu.uninit("sums", 1)?,
-            intersection_ranges: gpu.uninit("intersection_ranges", 0)?,
-            tiles: gpu.uninit("tiles", 0)?,
-            intersection_ids: gpu.uninit("intersection_ids", 0)?,
-            gaussian_ids: gpu.uninit("gaussian_ids", 0)?,
+            lists: Lists::new(gpu, 0, 0)?,
             gradient_records: gpu.uninit("gradient_records", 0)?,
             segment_states: gpu.uninit("segment_states", 1)?,
             render: gpu.uninit("render", 0)?,
@@ -126,7 +120,6 @@ impl RenderBuffers {
             tile_ranges: gpu.uninit("tile_ranges", 0)?,
             camera: gpu.zeros("camera", 1)?,
             instances: gpu.zeros("instances", 1)?,
-            counts: gpu.zeros("counts", 1)?,
             status: gpu.zeros("status", STATUS_WORDS as usize)?,
             arrivals: gpu.zeros("arrivals", 1)?,
             no_sizes: gpu.zeros("tile_sizes", 1)?,
@@ -164,14 +157,14 @@ impl RenderBuffers {
             self.intersection_offsets = gpu.uninit("intersection_offsets", count)?;
             let partitions = (count as u32).div_ceil(RANKS_PER_PARTITION).max(1);
             self.sums = gpu.uninit("sums", partitions as usize)?;
-            self.intersection_ranges = gpu.uninit("intersection_ranges", count)?;
+            self.lists.intersection_ranges = gpu.uninit("intersection_ranges", count)?;
             // Its length says that the others are there.
             self.splats = gpu.uninit("splats", count)?;
         }
         self.transmittances.grow(gpu, pixels)?;
         self.render.grow(gpu, self.channels * pixels)?;
         self.tile_ranges.grow(gpu, tiles)?;
-        if self.tiles.is_empty() {
+        if self.intersection_capacity() == 0 {
             let count = count.max(1024) as u32;
             let guess = match self.purpose {
                 Purpose::Train => count.saturating_mul(TILES_PER_GAUSSIAN),
@@ -188,11 +181,8 @@ impl RenderBuffers {
     pub(super) fn grow_intersections(&mut self, gpu: &Gpu, capacity: u32) -> Result<()> {
         let capacity = capacity as usize;
         let records = gpu.uninit("gradient_records", self.record_floats() * capacity)?;
-        let tiles = gpu.uninit("tiles", capacity)?;
-        let intersection_ids = gpu.uninit("intersection_ids", capacity)?;
         let states = gpu.uninit("segment_states", self.state_floats(capacity))?;
-        self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
-        (self.tiles, self.intersection_ids) = (tiles, intersection_ids);
+        self.lists.allocate(gpu, capacity)?;
         self.segment_states = states;
         self.gradient_records = records;
         Ok(())
@@ -200,21 +190,17 @@ impl RenderBuffers {
 
     pub(super) fn set_intersection_capacity(&mut self, gpu: &Gpu, capacity: u32) -> Result<()> {
         let capacity = capacity as usize;
-        if capacity != self.tiles.len() {
-            // The old buffer is freed first: both together may exceed the memory.
-            for numbers in [&mut self.tiles, &mut self.intersection_ids, &mut self.gaussian_ids] {
-                *numbers = gpu.uninit("intersections", 0)?;
-            }
+        if capacity != self.lists.tiles.len() {
+            // The old buffers are freed first: both together may exceed the memory.
+            self.lists.allocate(gpu, 0)?;
             self.gradient_records = gpu.uninit("gradient_records", 0)?;
             self.segment_states = gpu.uninit("segment_states", 1)?;
             gpu.free_unused();
-            self.intersection_ids = gpu.uninit("intersection_ids", capacity)?;
-            self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
             self.gradient_records =
                 gpu.uninit("gradient_records", self.record_floats() * capacity)?;
             self.segment_states = gpu.uninit("segment_states", self.state_floats(capacity))?;
             // Its length says that the others are there.
-            self.tiles = gpu.uninit("tiles", capacity)?;
+            self.lists.allocate(gpu, capacity)?;
         }
         Ok(())
     }
@@ -230,7 +216,7 @@ impl RenderBuffers {
     pub(super) fn bytes_per_intersection(&self) -> usize {
         let Segments { length, state } = self.segments;
         let state = if length == 0 { 0 } else { state.div_ceil(length) };
-        3 * size_of::<u32>() + (self.record_floats() + state as usize) * size_of::<f32>()
+        Lists::BYTES_PER_INTERSECTION + (self.record_floats() + state as usize) * size_of::<f32>()
     }
 
     /// The floats of the states of segments, or one that is bound in their place.
@@ -258,7 +244,7 @@ impl RenderBuffers {
     }
 
     pub(super) fn intersection_capacity(&self) -> u32 {
-        self.tiles.len() as u32
+        self.lists.tiles.len() as u32
     }
 }
 

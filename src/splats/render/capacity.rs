@@ -74,7 +74,7 @@ impl Renderer {
     pub(crate) fn reserved_bytes(&self) -> usize {
         let frame = &self.frame;
         frame.splats.len().saturating_sub(self.context_count()) * frame.bytes_per_gaussian()
-            + frame.tiles.len() * frame.bytes_per_intersection()
+            + frame.lists.tiles.len() * frame.bytes_per_intersection()
     }
 
     /// Bytes per intersection of a view.
@@ -95,7 +95,7 @@ impl Renderer {
 
     /// Takes the memory of the sorts ahead of a recording.
     pub(super) fn reserve_sorts(&mut self) -> Result<()> {
-        self.sort.reserve(self.frame.depth_keys.len(), self.frame.tiles.len())
+        self.sort.reserve(self.frame.depth_keys.len(), self.frame.lists.tiles.len())
     }
 
     fn too_many_tiles(&self, size: UVec2) -> Error {

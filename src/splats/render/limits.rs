@@ -32,10 +32,13 @@ const SEGMENT_OF_SHARED_TILE: u32 = 128;
 
 /// The splats of a segment; 0: a run has one segment.
 pub(super) fn segment_length(gpu: &Properties, purpose: Purpose, tile: Tile) -> u32 {
+    let built_in = match tile.subgroups {
+        _ if gpu.is_cpu => 0,
+        1 => SEGMENT,
+        _ => SEGMENT_OF_SHARED_TILE,
+    };
     match purpose {
-        Purpose::Train if gpu.is_cpu => 0,
-        Purpose::Train if tile.subgroups > 1 => SEGMENT_OF_SHARED_TILE,
-        Purpose::Train => SEGMENT,
+        Purpose::Train => tile.segment.unwrap_or(built_in),
         Purpose::Show => 0,
     }
 }

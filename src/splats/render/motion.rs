@@ -84,7 +84,7 @@ impl Renderer {
                 transmittances: frame.transmittances.slice(),
                 picks: match picks {
                     Some(picks) => picks.of_pixels.slice(),
-                    None => frame.counts.slice(),
+                    None => frame.lists.counts.slice(),
                 },
                 movers: motion.movers.slice(),
                 pixels: motion.pixels.slice_mut(),

@@ -109,8 +109,8 @@ impl Renderer {
             },
             pick_splats::Buffers {
                 tile_ranges: frame.tile_ranges.slice(),
-                sorted_intersections: frame.intersection_ids.slice(),
-                gaussian_ids: frame.gaussian_ids.slice(),
+                sorted_intersections: frame.lists.intersection_ids.slice(),
+                gaussian_ids: frame.lists.gaussian_ids.slice(),
                 splats: frame.splats.slice(),
                 colors: frame.colors.slice(),
                 limits: limits.slice(),

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use nightsplat_core::camera::CameraModel;
+use nightsplat_models::attributes::Attribute;
 use nightsplat_models::gaussians::Shape;
 
 use super::buffers::{RANKS_PER_PARTITION, RenderBuffers, Segments};
@@ -28,9 +29,7 @@ impl Renderer {
     /// # Errors
     /// The driver refuses a kernel, or the tile does not suit the device.
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
-        let tile = settings.tile_on(gpu)?;
-        let segment = segment_length(gpu.properties(), settings.purpose, tile);
-        Self::build(gpu, settings, WrittenGradients::ALL, tile, segment)
+        Self::build(gpu, settings, WrittenGradients::ALL)
     }
 
     /// [`Renderer::new`] with the kernels of its backward pass, which writes such gradients, but not those of the first
@@ -42,27 +41,15 @@ impl Renderer {
         gradients: GradientKind,
         frozen_columns: u32,
     ) -> Result<Self> {
-        let tile = settings.tile_on(gpu)?;
-        let segment = segment_length(gpu.properties(), settings.purpose, tile);
         let gradients = WrittenGradients { kind: gradients, frozen_columns };
-        let mut renderer = Self::build(gpu, settings, gradients, tile, segment)?;
+        let mut renderer = Self::build(gpu, settings, gradients)?;
         renderer.build_backward(ProjectionKind::pinhole(&renderer.settings))?;
         Ok(renderer)
     }
 
-    /// [`Renderer::new`] with segments of `segment` splats, a multiple of the subgroup size; 0: a run has one segment.
-    #[doc(hidden)]
-    pub fn with_segments(gpu: &Gpu, settings: RenderSettings, segment: u32) -> Result<Self> {
-        Self::build(gpu, settings, WrittenGradients::ALL, settings.tile_on(gpu)?, segment)
-    }
-
-    fn build(
-        gpu: &Gpu,
-        settings: RenderSettings,
-        gradients: WrittenGradients,
-        tile: Tile,
-        segment: u32,
-    ) -> Result<Self> {
+    fn build(gpu: &Gpu, settings: RenderSettings, gradients: WrittenGradients) -> Result<Self> {
+        let tile = settings.tile_on(gpu)?;
+        let segment = segment_length(gpu.properties(), settings.purpose, tile);
         let [tile_width, tile_height] = tile.size;
         let channels = settings.trained_channels() as u32;
         if channels > MAX_CHANNELS {
@@ -129,7 +116,8 @@ impl Renderer {
         }
         if self.blend_backward.is_none() {
             let segment = self.frame.segments.length;
-            self.blend_backward = Some(blending_backward(gpu, settings, *tile, segment)?);
+            self.blend_backward =
+                Some(blending_backward(gpu, settings, *tile, segment, *gradients)?);
         }
         if let Some(Projections { backward: backward @ None, .. }) = self.projections.get_mut(&kind)
         {
@@ -224,6 +212,12 @@ pub(super) struct WrittenGradients {
 
 impl WrittenGradients {
     const ALL: Self = Self { kind: GradientKind::All, frozen_columns: 0 };
+
+    /// The leading channels whose gradients reach the geometry; none if that is frozen.
+    fn shaping_channels(self, settings: &RenderSettings) -> u32 {
+        let is_frozen = self.frozen_columns as usize >= Attribute::Dc.column(0);
+        if is_frozen { 0 } else { settings.shaping_channels() }
+    }
 }
 
 /// The kernels that read Gaussians and cameras, the only ones that depend on the SH degree and the camera model.
@@ -284,7 +278,7 @@ fn projection_backward(
 fn blending(
     gpu: &Gpu,
     settings: &RenderSettings,
-    Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile }: Tile,
+    Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile, .. }: Tile,
     segment: u32,
     has_depths: bool,
 ) -> Result<Pipeline<blend_forward::Kernel>> {
@@ -305,15 +299,16 @@ fn blending(
 fn blending_backward(
     gpu: &Gpu,
     settings: &RenderSettings,
-    Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile }: Tile,
+    Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile, .. }: Tile,
     segment: u32,
+    gradients: WrittenGradients,
 ) -> Result<Pipeline<blend_backward::Kernel>> {
     gpu.pipeline(&blend_backward::Constants {
         alpha_max: settings.max_alpha,
         channels: settings.trained_channels() as u32,
         tile_width,
         tile_height,
-        shaping_channels: settings.shaping_channels(),
+        shaping_channels: gradients.shaping_channels(settings),
         view_depths: settings.keeps_depth().into(),
         skips_groups: !gpu.properties().is_cpu,
         splats_per_turn: splats_per_turn(gpu),

@@ -103,8 +103,10 @@ fn gpu_tile(properties: &Properties, channels: usize, pixels: Option<u64>) -> Ti
     let is_small = pixels.is_some_and(|pixels| pixels <= SMALL_VIEW);
     let is_narrow = properties.subgroup_size < WIDE_SUBGROUP;
     let divisor = if is_narrow && channels > TILE_CHANNELS { 2 } else { 1 };
-    let of =
-        |[width, height]: [u32; 2], subgroups| Tile { size: [width, height / divisor], subgroups };
+    let of = |[width, height]: [u32; 2], subgroups| Tile {
+        subgroups,
+        ..[width, height / divisor].into()
+    };
     let shared = of(GPU_TILE, 4);
     match properties.suits_tile(shared) {
         true if is_small || is_narrow => shared,
@@ -137,6 +139,10 @@ impl RenderSettings {
         let of = match tile.subgroups {
             1 => "",
             _ => " of each of 1, 2 or 4 subgroups",
+        };
+        let of = match tile.segment {
+            None => of.to_owned(),
+            Some(_) => format!("{of}, with segments of a multiple of {lanes} splats"),
         };
         let remedy = format!("1 to 32 times {lanes} pixels{of}; without `tile` the device chooses");
         let problem = format!("{tile} tiles do not suit {lanes} lanes");
@@ -184,7 +190,7 @@ mod tests {
 
     #[test]
     fn subgroups_share_the_tiles_of_small_views_on_a_gpu_that_keeps_them_together() {
-        let shared = Tile { size: [16, 16], subgroups: 4 };
+        let shared = Tile { subgroups: 4, ..[16, 16].into() };
         let gpu = Properties {
             subgroup_size: 32,
             has_uniform_subgroup_control_flow: true,

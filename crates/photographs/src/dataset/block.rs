@@ -1,6 +1,9 @@
 //! A part of a dataset that is trained by itself: `block.toml` names the dataset, and which of its views and points
 //! belong to the block. The photographs stay where they are.
 
+pub mod partition;
+pub mod visibility;
+
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 

@@ -47,16 +47,28 @@ impl Undistortion {
 
     /// The pinhole's image of a photograph of the lens's size, by bicubic interpolation in float.
     pub(super) fn apply(&self, photograph: &Image) -> Image {
+        /// Output rows whose source rows are in memory at a time, with the channels of a pixel side by side.
+        const ROWS: usize = 32;
+        let Image { width, height, .. } = *photograph;
+        let [columns, rows] = [width, height].map(|side| side as usize);
         let pixels = photograph.pixel_count();
         let mut data = vec![0.0; 3 * pixels];
-        let planes = [0, 1, 2].map(|plane| &photograph.data[plane * pixels..][..pixels]);
-        for (index, position) in self.positions.iter().enumerate() {
-            let taps = Taps::at(*position, photograph.width as usize, photograph.height as usize);
-            for (plane, value) in taps.sample(planes).into_iter().enumerate() {
-                data[plane * pixels + index] = value;
+        for (band, positions) in self.positions.chunks(ROWS * columns.max(1)).enumerate() {
+            let ys = || positions.iter().map(|[_, y]| *y);
+            let [top, bottom] = [ys().fold(f32::INFINITY, f32::min), ys().fold(0.0, f32::max)];
+            let [first, last] = [cubic(top, rows).0[0], cubic(bottom, rows).0[3]];
+            let source = columns * first..columns * (last + 1);
+            let values = |plane: usize| &photograph.data[plane * pixels..][source.clone()];
+            let colors = values(0).iter().zip(values(1)).zip(values(2));
+            let colors: Vec<Vec4> = colors.map(|((&r, &g), &b)| Vec4::new(r, g, b, 0.0)).collect();
+            for (index, position) in (band * ROWS * columns..).zip(positions) {
+                let taps = Taps::at(*position, columns, rows);
+                let color = taps.sample(&colors, columns, source.start);
+                (data[index], data[pixels + index], data[2 * pixels + index]) =
+                    (color.x, color.y, color.z);
             }
         }
-        Image { width: photograph.width, height: photograph.height, data }
+        Image { width, height, data }
     }
 }
 
@@ -125,7 +137,6 @@ fn fits(lens: &Lens, zoom: f64, widest: f64) -> bool {
 struct Taps {
     columns: [usize; 4],
     across: [f32; 4],
-    /// Start indices of the four rows.
     rows: [usize; 4],
     down: [f32; 4],
 }
@@ -134,39 +145,28 @@ impl Taps {
     fn at([x, y]: [f32; 2], width: usize, height: usize) -> Self {
         let (columns, across) = cubic(x, width);
         let (rows, down) = cubic(y, height);
-        Self { columns, across, rows: rows.map(|row| row * width), down }
+        Self { columns, across, rows, down }
     }
 
-    /// All planes at once: one plane's sum waits for each addition, three keep the processor busy. The least and the
-    /// largest value are of each column first.
-    fn sample<const N: usize>(&self, planes: [&[f32]; N]) -> [f32; N] {
-        let mut sum = [0.0; N];
-        let mut range = [[Vec4::INFINITY, Vec4::NEG_INFINITY]; N];
+    /// All channels at once. `colors`: rows of `width` pixels from the pixel `first` on.
+    fn sample(&self, colors: &[Vec4], width: usize, first: usize) -> Vec4 {
+        let mut sum = Vec4::ZERO;
+        let [mut low, mut high] = [Vec4::INFINITY, Vec4::NEG_INFINITY];
         for (row, down) in self.rows.iter().zip(self.down) {
-            let weights = down * Vec4::from(self.across);
-            for plane in 0..N {
-                let values = self.columns_of(&planes[plane][*row..]);
-                for product in (weights * values).to_array() {
-                    sum[plane] += product;
-                }
+            let row = &colors[row * width - first..][..width];
+            for (&column, across) in self.columns.iter().zip(self.across) {
+                let color = row[column];
+                sum += down * across * color;
                 // Not `min` and `max`, which treat a NaN as the processor does.
-                let [low, high] = range[plane];
-                let low = Vec4::select(values.cmplt(low), values, low);
-                range[plane] = [low, Vec4::select(values.cmpgt(high), values, high)];
+                low = Vec4::select(color.cmplt(low), color, low);
+                high = Vec4::select(color.cmpgt(high), color, high);
             }
         }
-        std::array::from_fn(|plane| {
-            let [low, high] = range[plane];
-            sum[plane].max(low.min_element()).min(high.max_element())
-        })
-    }
-
-    fn columns_of(&self, row: &[f32]) -> Vec4 {
-        let [first, .., last] = self.columns;
-        match row.get(first..=last) {
-            Some(four @ [_, _, _, _]) => Vec4::from_slice(four),
-            _ => self.columns.map(|column| row[column]).into(),
-        }
+        let [low, high] = [low, high].map(|colors| colors.to_array());
+        let value = |(at, sum): (usize, f32)| sum.max(low[at]).min(high[at]);
+        let [r, g, b, _] = sum.to_array();
+        let [r, g, b] = [(0, r), (1, g), (2, b)].map(value);
+        Vec4::new(r, g, b, 0.0)
     }
 }
 
@@ -291,9 +291,9 @@ mod tests {
 
     #[test]
     fn interpolation_stays_within_the_range_of_its_pixels() {
-        let plane = [0.0, 0.0, 1.0, 1.0].repeat(4);
+        let plane = [Vec4::ZERO, Vec4::ZERO, Vec4::ONE, Vec4::ONE].repeat(4);
         for x in (0..=40).map(|step| step as f32 / 10.0) {
-            let [value] = Taps::at([x, 2.0], 4, 4).sample([&plane]);
+            let value = Taps::at([x, 2.0], 4, 4).sample(&plane, 4, 0).x;
             assert!((0.0..=1.0).contains(&value), "{x}: {value}");
         }
     }

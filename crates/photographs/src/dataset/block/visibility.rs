@@ -1,7 +1,7 @@
 //! Which views show a block, by the points that they see.
 
+use crate::dataset::{Dataset, Point, View};
 use glam::DVec3;
-use nightsplat_photographs::dataset::{Dataset, Point, View};
 use rayon::prelude::*;
 
 use super::partition::BlockCells;
@@ -20,19 +20,20 @@ const NEW_SHARE: f64 = 0.1;
 const SAMPLES: usize = 20_000;
 
 /// What the views of a dataset see.
-pub(crate) struct Visibility<'a> {
+#[derive(Debug)]
+pub struct Visibility<'a> {
     dataset: &'a Dataset,
     /// The training views with photographs, as indices into the dataset's views.
-    pub(crate) training: Vec<usize>,
+    pub training: Vec<usize>,
     /// The points that each of them sees, ascending.
     seen: Vec<Vec<u32>>,
     /// The scene's up direction, a unit vector.
-    pub(crate) up: DVec3,
+    pub up: DVec3,
 }
 
 impl<'a> Visibility<'a> {
     /// By the recorded tracks of the points; where there are none, every point in a view's frame counts as seen.
-    pub(crate) fn new(dataset: &'a Dataset) -> Self {
+    pub fn new(dataset: &'a Dataset) -> Self {
         let is_used = |view: &View| view.is_train() && view.has_photograph();
         let all = dataset.views.iter().enumerate();
         let training: Vec<usize> =
@@ -70,7 +71,7 @@ impl<'a> Visibility<'a> {
 
     /// The number of pixels for which each point stands: a view's pixels are shared by its points. In units of their
     /// mean.
-    pub(crate) fn pixel_shares(&self) -> Vec<f64> {
+    pub fn pixel_shares(&self) -> Vec<f64> {
         let mut shares = vec![0.0; self.dataset.points.len()];
         for seen in self.seen.iter().filter(|seen| !seen.is_empty()) {
             let each = 1.0 / seen.len() as f64;
@@ -82,7 +83,7 @@ impl<'a> Visibility<'a> {
     }
 
     /// The views that serve each part, as ascending places in [`Self::training`].
-    pub(crate) fn serving(&self, parts: &[BlockCells]) -> Vec<Vec<usize>> {
+    pub fn serving(&self, parts: &[BlockCells]) -> Vec<Vec<usize>> {
         let owner =
             |point: &Point| parts.iter().position(|part| part.core.contains(point.position));
         let part_of: Vec<Option<usize>> = self.dataset.points.par_iter().map(owner).collect();
@@ -124,7 +125,7 @@ impl<'a> Visibility<'a> {
     }
 
     /// The views of the coarse model: in an order that covers the cameras, those that add to points seen by few.
-    pub(crate) fn thinned(&self) -> Vec<usize> {
+    pub fn thinned(&self) -> Vec<usize> {
         let mut views_of = vec![0_usize; self.dataset.points.len()];
         let mut views = vec![];
         for view in scattered(self.training.len()) {
@@ -152,10 +153,10 @@ mod tests {
     use glam::{DAffine3, DVec3};
 
     use super::*;
-    use crate::blocks::partition::{Until, WeightedPoint, partition};
+    use crate::dataset::Split;
+    use crate::dataset::block::partition::{Until, WeightedPoint, partition};
+    use crate::image::Image;
     use nightsplat_core::camera::Camera;
-    use nightsplat_photographs::dataset::Split;
-    use nightsplat_photographs::image::Image;
 
     /// `count` views along a street, each of which sees the points within 4 of it.
     fn street(count: u32, has_tracks: bool) -> Dataset {

@@ -3,8 +3,8 @@
 //! The points are sorted by position alone, and sums are taken in that order: neither the order of the points in their
 //! file nor the number of threads changes a bit.
 
+use super::Cell;
 use glam::DVec3;
-use nightsplat_photographs::dataset::block::Cell;
 
 /// The halo reaches this share of the core's side beyond each face of the core.
 const HALO: f64 = 0.2;
@@ -19,23 +19,27 @@ const OUTLIERS: f64 = 0.02;
 
 /// A point with its share of the scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct WeightedPoint {
-    pub(crate) position: DVec3,
-    pub(crate) weight: f64,
+pub struct WeightedPoint {
+    /// In world units.
+    pub position: DVec3,
+    /// What training on it costs, in any unit.
+    pub weight: f64,
 }
 
 /// A cell with its surroundings.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct BlockCells {
-    pub(crate) core: Cell,
-    pub(crate) halo: Cell,
+pub struct BlockCells {
+    /// The cell; those of a scene do not overlap.
+    pub core: Cell,
+    /// The cell with its surroundings.
+    pub halo: Cell,
     /// The weight of the points in core and halo, relative to all points.
-    pub(crate) share: f64,
+    pub share: f64,
 }
 
 /// When to stop splitting.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Until {
+pub enum Until {
     /// There are this many cells.
     Count(usize),
     /// No cell with its halo has more than this share of the weight.
@@ -44,11 +48,7 @@ pub(crate) enum Until {
 
 /// The cells of a scene, in the order of the tree; `None` if points at one place cannot be split further. `up` is the
 /// scene's up direction.
-pub(crate) fn partition(
-    points: &[WeightedPoint],
-    up: DVec3,
-    until: Until,
-) -> Option<Vec<BlockCells>> {
+pub fn partition(points: &[WeightedPoint], up: DVec3, until: Until) -> Option<Vec<BlockCells>> {
     let mut sorted = points.to_vec();
     sorted.sort_by(|a, b| by_position(a, b, 0));
     let total: f64 = sorted.iter().map(|point| point.weight).sum();
