@@ -4,7 +4,7 @@ use nightsplat_core::watch::Stage;
 
 use super::call::Call;
 use super::config::TrainConfig;
-use super::memory::recomputable_bytes;
+use super::memory::list_bytes;
 use super::model::TrainedModel;
 use super::views::Views;
 use crate::Result;
@@ -23,7 +23,7 @@ impl TrainedModel {
             return Ok(());
         }
         let (gaussians, viewpoints) = (self.gaussians.values.slice(), &mut views.viewpoints);
-        let limit = recomputable_bytes(gpu, config);
+        let limit = list_bytes(gpu, config);
         let [kept, all] = viewpoints.kept_and_all();
         let stage = Stage::after("sorting views", kept, all);
         while call.has_time() && self.renderer.keep_next_lists(gaussians, viewpoints, limit)? {
@@ -41,8 +41,8 @@ mod tests {
     use nightsplat_synth::SyntheticOptions;
 
     use super::*;
-    use crate::gpu::testing::{gpu, gpu_that_sorts_tiles};
-    use crate::train::Trainer;
+    use crate::gpu::testing::{gpu_that_sorts_tiles, gpu_with};
+    use crate::train::{CacheSize, Trainer};
 
     /// Ten views at most: five at two sizes.
     #[test]
@@ -55,11 +55,14 @@ mod tests {
         let dataset = Dataset::load(&config.dataset, &config.load_options()).unwrap();
         let freeze = Some("means,quats,scales,opacities".parse().unwrap());
         let frozen = TrainConfig { init: Some("day.ply".into()), freeze, ..config.clone() };
-        for gpu in [gpu(), gpu_that_sorts_tiles()] {
+        for gpu in [gpu_with(|_| ()), gpu_that_sorts_tiles()] {
             let day = Trainer::new(&gpu, config.clone(), &dataset).unwrap().gaussians().unwrap();
             let trained = [0, 2, 10].map(|most| {
                 let config = frozen.clone();
                 let mut trainer = Trainer::from_gaussians(&gpu, config, &dataset, &day).unwrap();
+                let in_use = Some(CacheSize(gpu.memory_in_use()));
+                let full = TrainConfig { max_vram: in_use, ..frozen.clone() };
+                assert_eq!(list_bytes(&gpu, &full), 0);
                 let kept = |trainer: &Trainer| trainer.supervision.views.viewpoints.kept_and_all();
                 trainer.advance_within(1, Duration::ZERO).unwrap();
                 assert_eq!(kept(&trainer), [0, 10], "a call without time");
@@ -67,10 +70,10 @@ mod tests {
                 let TrainedModel { gaussians, renderer, .. } = &mut trainer.model;
                 // The last has no memory for another.
                 let limits = (0..=most).map(|at| if at < most { 1 << 30 } else { 0 });
-                let others = limits.map(|limit| {
+                let are_kept = limits.map(|limit| {
                     renderer.keep_next_lists(gaussians.values.slice(), views, limit).unwrap()
                 });
-                assert_eq!(others.filter(|&other| other).count(), most);
+                assert_eq!(are_kept.filter(|&is_kept| is_kept).count(), most);
                 while !trainer.has_ended() {
                     trainer.advance(20).unwrap();
                 }

@@ -187,16 +187,26 @@ impl Memory {
     }
 }
 
-/// The most bytes for a kind of data that could be recomputed, by the limits of memory and the device's.
-pub(super) fn recomputable_bytes(gpu: &Gpu, config: &TrainConfig) -> u64 {
+/// The bytes of the device that a training may use, by the limits of memory and the device's.
+fn usable_bytes(gpu: &Gpu, config: &TrainConfig) -> f64 {
     let device = gpu.properties();
     let most = |CacheSize(bytes): CacheSize| bytes.min(device.memory);
     let vram = config.max_vram.map_or(device.memory, most) as f64;
-    let bytes = match config.max_ram {
+    match config.max_ram {
         Some(CacheSize(ram)) if device.is_cpu => vram.min((ram as f64 - PROGRAM).max(0.0)),
         _ => vram,
-    };
-    (RECOMPUTABLE * bytes) as u64
+    }
+}
+
+/// The most bytes for activations that could be recomputed.
+pub(super) fn activation_bytes(gpu: &Gpu, config: &TrainConfig) -> u64 {
+    (RECOMPUTABLE * usable_bytes(gpu, config)) as u64
+}
+
+/// The most bytes for sorted intersections of views, which must not fill what is free.
+pub(super) fn list_bytes(gpu: &Gpu, config: &TrainConfig) -> u64 {
+    let free = usable_bytes(gpu, config) - gpu.memory_in_use() as f64;
+    activation_bytes(gpu, config).min((0.5 * free) as u64)
 }
 
 /// The intersections of the first Gaussians in the largest view, for which memory is then reserved.

@@ -20,7 +20,7 @@ use super::context::Initial;
 use super::gaussians::TrainedGaussians;
 use super::lamp::{self, LampLearning};
 use super::masks::Masks;
-use super::memory::{Memory, recomputable_bytes};
+use super::memory::{Memory, activation_bytes};
 use super::model::{Density, Optimizer, TrainedModel};
 use super::passes::{TrainKernels, first_sh_degree};
 use super::supervision::Supervision;
@@ -242,7 +242,7 @@ impl Trainer {
         }
         model.reserve(&supervision.views)?;
         if let Some(terms) = &mut supervision.networks {
-            terms.keep_activations(&sizes, recomputable_bytes(gpu, &config))?;
+            terms.keep_activations(&sizes, activation_bytes(gpu, &config))?;
         }
         let extent = config.extent_of(dataset) * frame.scale;
         let config = Arc::new(config);

@@ -33,9 +33,9 @@ fn bytes(gaussians: usize, intersections: usize) -> u64 {
 }
 
 impl Renderer {
-    /// Keeps the sorted intersections of the next view, within `limit` bytes for all of them; returns whether there is
-    /// another to keep. Renders of the view no longer sort. Until [`Viewpoints::forget_lists`], the means, shapes and
-    /// opacities of the Gaussians and the context must not change.
+    /// Keeps the sorted intersections of the next view, within `limit` bytes for those of all views; false if there is
+    /// no next view, or no memory for it. Renders of the view no longer sort. Until [`Viewpoints::forget_lists`], the
+    /// means, shapes and opacities of the Gaussians and the context must not change.
     ///
     /// # Errors
     /// Those of a render.
