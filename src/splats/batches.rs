@@ -22,6 +22,11 @@ pub struct Batches {
     rest_by_column: bool,
 }
 
+/// Whether these columns, from the first, hold all that splats depend on but colours: means, shapes and opacities.
+pub(crate) fn freezes_splats(frozen_columns: u32) -> bool {
+    frozen_columns as usize >= Attribute::Dc.column(0)
+}
+
 /// Whether SH coefficients above degree 0 are stored word by word, each for all Gaussians of a batch, instead of
 /// Gaussian by Gaussian. On a GPU, the lanes of a subgroup, one for each Gaussian, then access neighbouring words. A
 /// CPU accesses the words of each lane by themselves. Files have them Gaussian by Gaussian.

@@ -34,6 +34,7 @@ use super::streams;
 use crate::gpu::Tile;
 use crate::loss::{LossConfig, ParameterWeights};
 use crate::networks::NetworkVariant;
+use crate::splats::batches::freezes_splats;
 use crate::splats::densify::DensityControl;
 use crate::splats::lamp::Lamp;
 use crate::splats::optimizer::Schedule;
@@ -454,9 +455,9 @@ impl TrainConfig {
         self.freeze.as_ref().is_some_and(|freeze| freeze.has(attribute))
     }
 
-    /// Whether means, shapes and opacities are frozen: every view has the same splats in every step.
+    /// Whether every view has the same splats in every step.
     pub(super) fn freezes_splats(&self) -> bool {
-        self.frozen_columns() as usize >= Attribute::Dc.column(0)
+        freezes_splats(self.frozen_columns())
     }
 
     /// The columns of the Gaussians' attributes, from the first, that no pass updates.

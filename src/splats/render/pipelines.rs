@@ -4,7 +4,6 @@
 use std::collections::BTreeMap;
 
 use nightsplat_core::camera::CameraModel;
-use nightsplat_models::attributes::Attribute;
 use nightsplat_models::gaussians::Shape;
 
 use super::buffers::{RANKS_PER_PARTITION, RenderBuffers, Segments};
@@ -17,7 +16,7 @@ use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
     blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
-use crate::splats::batches::{GradientKind, rest_by_column};
+use crate::splats::batches::{GradientKind, freezes_splats, rest_by_column};
 use crate::splats::camera::model_number;
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
@@ -215,8 +214,7 @@ impl WrittenGradients {
 
     /// The leading channels whose gradients reach the geometry; none if that is frozen.
     fn shaping_channels(self, settings: &RenderSettings) -> u32 {
-        let is_frozen = self.frozen_columns as usize >= Attribute::Dc.column(0);
-        if is_frozen { 0 } else { settings.shaping_channels() }
+        if freezes_splats(self.frozen_columns) { 0 } else { settings.shaping_channels() }
     }
 }
 

@@ -64,8 +64,9 @@ impl Undistortion {
             for (index, position) in (band * ROWS * columns..).zip(positions) {
                 let taps = Taps::at(*position, columns, rows);
                 let color = taps.sample(&colors, columns, source.start);
-                (data[index], data[pixels + index], data[2 * pixels + index]) =
-                    (color.x, color.y, color.z);
+                for (plane, value) in color.into_iter().enumerate() {
+                    data[plane * pixels + index] = value;
+                }
             }
         }
         Image { width, height, data }
@@ -149,7 +150,7 @@ impl Taps {
     }
 
     /// All channels at once. `colors`: rows of `width` pixels from the pixel `first` on.
-    fn sample(&self, colors: &[Vec4], width: usize, first: usize) -> Vec4 {
+    fn sample(&self, colors: &[Vec4], width: usize, first: usize) -> [f32; 3] {
         let mut sum = Vec4::ZERO;
         let [mut low, mut high] = [Vec4::INFINITY, Vec4::NEG_INFINITY];
         for (row, down) in self.rows.iter().zip(self.down) {
@@ -162,11 +163,7 @@ impl Taps {
                 high = Vec4::select(color.cmpgt(high), color, high);
             }
         }
-        let [low, high] = [low, high].map(|colors| colors.to_array());
-        let value = |(at, sum): (usize, f32)| sum.max(low[at]).min(high[at]);
-        let [r, g, b, _] = sum.to_array();
-        let [r, g, b] = [(0, r), (1, g), (2, b)].map(value);
-        Vec4::new(r, g, b, 0.0)
+        std::array::from_fn(|channel| sum[channel].max(low[channel]).min(high[channel]))
     }
 }
 
@@ -293,7 +290,7 @@ mod tests {
     fn interpolation_stays_within_the_range_of_its_pixels() {
         let plane = [Vec4::ZERO, Vec4::ZERO, Vec4::ONE, Vec4::ONE].repeat(4);
         for x in (0..=40).map(|step| step as f32 / 10.0) {
-            let value = Taps::at([x, 2.0], 4, 4).sample(&plane, 4, 0).x;
+            let [value, ..] = Taps::at([x, 2.0], 4, 4).sample(&plane, 4, 0);
             assert!((0.0..=1.0).contains(&value), "{x}: {value}");
         }
     }

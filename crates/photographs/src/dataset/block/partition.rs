@@ -3,8 +3,9 @@
 //! The points are sorted by position alone, and sums are taken in that order: neither the order of the points in their
 //! file nor the number of threads changes a bit.
 
-use super::Cell;
 use glam::DVec3;
+
+use super::Cell;
 
 /// The halo reaches this share of the core's side beyond each face of the core.
 const HALO: f64 = 0.2;

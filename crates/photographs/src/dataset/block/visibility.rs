@@ -1,10 +1,10 @@
 //! Which views show a block, by the points that they see.
 
-use crate::dataset::{Dataset, Point, View};
 use glam::DVec3;
 use rayon::prelude::*;
 
 use super::partition::BlockCells;
+use crate::dataset::{Dataset, Point, View};
 
 /// A view serves a block that contains this share of its points.
 const SHARE: f64 = 0.05;
