@@ -47,6 +47,20 @@ pub(super) fn impossible(lens: &Lens) -> Option<String> {
     })
 }
 
+/// The reason why the lenses of most photographs, of which each has its number, cannot be; `None` if they can.
+pub(super) fn mostly_impossible(lenses: &[(Lens, usize)]) -> Option<String> {
+    let taken: usize = lenses.iter().map(|(_, photographs)| photographs).sum();
+    let mut first = None;
+    let mut with_problem = 0;
+    for (lens, photographs) in lenses {
+        if let Some(problem) = impossible(lens) {
+            with_problem += photographs;
+            first.get_or_insert_with(|| format!("{}: {problem}", describe(lens)));
+        }
+    }
+    first.filter(|_| 2 * with_problem > taken)
+}
+
 /// The reason why no real lens has this calibration; `None` if it is plausible.
 pub(super) fn implausible(lens: &Lens) -> Option<String> {
     /// Ratio of the focal lengths. Pixels are square; an anamorphic lens has 1.33.

@@ -282,17 +282,10 @@ fn best_model(models: &Path) -> Result<Option<Found>> {
 /// Those of most of its photographs cannot be.
 fn possible_lenses(model: &Path, photos: &Path) -> Result<Vec<Lens>> {
     let lenses = Dataset::lenses(model)?;
-    let taken: usize = lenses.iter().map(|(_, photographs)| photographs).sum();
-    let of_lens = |(lens, photographs): &(Lens, usize)| {
-        cameras::impossible(lens)
-            .map(|problem| (*photographs, format!("{}: {problem}", describe(lens))))
-    };
-    let impossible: Vec<(usize, String)> = lenses.iter().filter_map(of_lens).collect();
-    if 2 * impossible.iter().map(|(photographs, _)| photographs).sum::<usize>() > taken {
+    if let Some(problem) = cameras::mostly_impossible(&lenses) {
         let problem = format!(
-            "COLMAP's calibration cannot be, {}; mask what moves with the camera (masks/ beside the photographs), take \
-             more of them, closer together, or try --camera-model SIMPLE_RADIAL, which has one focal length",
-            impossible[0].1
+            "COLMAP's calibration cannot be, {problem}; mask what moves with the camera (masks/ beside the photographs), take \
+             more of them, closer together, or try --camera-model SIMPLE_RADIAL, which has one focal length"
         );
         return Err(Error::input(photos, problem));
     }

@@ -76,7 +76,8 @@ pub(super) struct Reconstruction<'a> {
     models: PathBuf,
 }
 
-/// The models of an attempt, and the number of dark photographs in the one with the most of them.
+/// The models of an attempt, and the number of dark photographs in the one with the most of them: 0 if its calibration
+/// cannot be.
 struct Attempt {
     models: PathBuf,
     placed: usize,
@@ -84,10 +85,16 @@ struct Attempt {
 
 impl Attempt {
     fn read(models: &Path) -> Result<Self> {
-        let largest = Dataset::largest_model(models, is_dark)?;
-        let placed =
-            largest.map_or(0, |(_, placed)| placed.iter().filter(|name| is_dark(name)).count());
-        Ok(Self { models: models.to_owned(), placed })
+        let mut attempt = Self { models: models.to_owned(), placed: 0 };
+        if let Some((model, placed)) = Dataset::largest_model(models, is_dark)? {
+            match cameras::mostly_impossible(&Dataset::lenses(&model)?) {
+                Some(problem) => {
+                    tracing::warn!("cameras without a possible calibration do not count, {problem}")
+                }
+                None => attempt.placed = placed.iter().filter(|name| is_dark(name)).count(),
+            }
+        }
+        Ok(attempt)
     }
 
     /// Takes another that has more.
@@ -200,7 +207,8 @@ impl<'a> Reconstruction<'a> {
     /// If most of the dark photographs have no camera, learned features are tried where this COLMAP has them, and kept
     /// if they give more. If more than a tenth have none, all are matched again, guided: without it, the result of a
     /// small set depends on chance; always matching guided would double the time of a large one. If most still have
-    /// none, the choice of the initial pair is relaxed. All of this together takes [`PoseOptions::patience`] times the
+    /// none, the choice of the initial pair is relaxed. Cameras whose calibration cannot be count as none: the same
+    /// photographs have another one in most further attempts. All of this together takes [`PoseOptions::patience`] times the
     /// time of the first attempt at most. Stages that an earlier call has done are not repeated.
     pub(super) fn models(
         mut self,

@@ -91,6 +91,18 @@ fn an_implausible_calibration_is_reported() {
     let cannot_be = "photos: COLMAP's calibration cannot be, 40x30 with focal length 35 x 93";
     refused(&pose(root), 3, &[cannot_be, "2.7 times", "--camera-model"]);
     assert!(!root.join("scene").exists() && root.join("scene.colmap.log").is_file());
+
+    // The next attempt finds one that can be.
+    model(9).write_binary(&root.join("possible/0"));
+    stub(
+        root,
+        "mapper) case $output in */guided) cp -r $root/possible/* $output;; *) cp -r $root/models/* $output;; esac;;",
+    );
+    let told = finds_cameras(&pose(root), 9, 9);
+    says(
+        &told,
+        &["do not count, 40x30 with focal length 35 x 93", "0 of 9 have a camera: matching again"],
+    );
 }
 
 #[test]
