@@ -5,7 +5,7 @@
 //! log2 brightness(p, v) = albedo_p + exposure_v - exponent log2 d - k1 u - k2 u^2,   u = 1 - cos(angle off the axis)
 //! ```
 //!
-//! Robust least squares (Huber), albedos and exposures by alternating projections. What each cause explains is measured
+//! Robust least squares (Huber), albedos and exposures by conjugate gradients. What each cause explains is measured
 //! on points that its coefficients were not fitted to, so that noise explains nothing. The albedo is the point's own:
 //! light that does not move with the camera, such as a window's, explains nothing either.
 

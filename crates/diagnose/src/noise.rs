@@ -75,10 +75,14 @@ pub(super) fn patches(plane: &[f32], width: usize, step: f64) -> Vec<NoisePatch>
 }
 
 fn patch(rows: [&[f32]; SIDE], step: f64) -> NoisePatch {
-    let values = || rows.iter().flat_map(|row| row.iter().map(|&value| f64::from(value)));
     let count = (SIDE * SIDE) as f64;
-    let is_clipped = values().any(|value| value >= 1.0);
-    let signal = if is_clipped { f64::NAN } else { values().sum::<f64>() / count };
+    let (mut sum, mut zeros, mut is_clipped) = (0.0, 0, false);
+    for &value in rows.into_iter().flatten() {
+        sum += f64::from(value);
+        zeros += u32::from(value <= 0.0);
+        is_clipped |= value >= 1.0;
+    }
+    let signal = if is_clipped { f64::NAN } else { sum / count };
     let curved = |of: &[f32]| f64::from(of[0] - 2.0 * of[1] + of[2]).powi(2);
     let squares: f64 = rows.iter().flat_map(|row| row.windows(3).map(curved)).sum();
     let mut squared_means = 0.0;
@@ -92,18 +96,13 @@ fn patch(rows: [&[f32]; SIDE], step: f64) -> NoisePatch {
         variance: squares / (SIDE * (SIDE - 2)) as f64 / 6.0,
         texture: squared_means / (count / 4.0) - signal * signal,
         quantization: (step * slope(signal)).powi(2) / 12.0,
-        zeros: values().filter(|&value| value <= 0.0).count() as f64 / count,
+        zeros: f64::from(zeros) / count,
     }
 }
 
 /// Linear light per encoded value at a linear value.
 pub(super) fn slope(linear: f64) -> f64 {
-    if linear <= 0.003_130_8 {
-        1.0 / 12.92
-    } else {
-        let encoded = 1.055 * linear.powf(1.0 / 2.4) - 0.055;
-        2.4 / 1.055 * ((encoded + 0.055) / 1.055).powf(1.4)
-    }
+    if linear <= 0.003_130_8 { 1.0 / 12.92 } else { 2.4 / 1.055 * linear.powf(1.4 / 2.4) }
 }
 
 /// Fits the line to the flat patches; `None` if there are too few.
@@ -135,8 +134,8 @@ impl Bin {
         if flat < MIN_PATCHES {
             return None;
         }
-        patches.sort_unstable_by(|a, b| a.texture.total_cmp(&b.texture));
-        let flat = &patches[..flat];
+        let (flat, ..) =
+            patches.select_nth_unstable_by(flat, |a, b| a.texture.total_cmp(&b.texture));
         let mean =
             |of: fn(&NoisePatch) -> f64| flat.iter().map(of).sum::<f64>() / flat.len() as f64;
         let variance = mean(|patch| patch.variance - patch.quantization);

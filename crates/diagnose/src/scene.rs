@@ -77,13 +77,14 @@ impl SceneDiagnosis {
         points: usize,
     ) -> Self {
         let patches = photographs.into_iter().zip(views).filter(|(_, view)| !view.is_black);
-        let noise = noise::fit(patches.flat_map(|(one, _)| one.patches).collect());
+        let patches = patches.flat_map(|(one, _)| one.patches);
         let lit: Vec<&ViewDiagnosis> = views.iter().filter(|view| !view.is_black).collect();
         let mean = |of: fn(&ViewDiagnosis) -> f64| {
             lit.iter().map(|view| of(view)).sum::<f64>() / lit.len().max(1) as f64
         };
         let tracks = shading.as_ref().map(|(.., tracks)| tracks).map_err(Clone::clone);
-        let lamp = tracks.and_then(LampDiagnosis::new);
+        let (noise, lamp) =
+            rayon::join(|| noise::fit(patches.collect()), || tracks.and_then(LampDiagnosis::new));
         let (falloff, bands) = shading.ok().map(|(falloff, bands, _)| (falloff, bands)).unzip();
         let is_lamp = lamp.as_ref().is_ok_and(LampDiagnosis::is_found);
         let measured = deviation(lit.iter().filter_map(|view| view.exposure));

@@ -11,6 +11,7 @@
 use std::f64::consts::{LN_2, TAU};
 
 use nightsplat_photographs::dataset::RowBands;
+use rayon::prelude::*;
 use serde::Serialize;
 
 use super::fit::LampObservations;
@@ -48,15 +49,15 @@ impl BandsDiagnosis {
         let share = |count: f64| {
             rows.share_of(&rows.waves(&left, &weights, count).about_mean(), &left, &weights)
         };
-        let best = |counts: &mut dyn Iterator<Item = f64>| {
-            let shares = counts.map(|count| (share(count), count));
-            shares.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default()
+        let best = |first: f64, steps: usize, per_height: usize| {
+            let counts =
+                (0..=steps).into_par_iter().map(|step| first + step as f64 / per_height as f64);
+            let shares: Vec<(f64, f64)> = counts.map(|count| (share(count), count)).collect();
+            shares.into_iter().max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default()
         };
         let [coarse, fine] = STEPS;
-        let (_, near) =
-            best(&mut (coarse..=coarse * MAX_PERIODS).map(|step| step as f64 / coarse as f64));
-        let around = (0..=2 * fine / coarse).map(|step| step as f64 / fine as f64);
-        let (share, count) = best(&mut around.map(|step| near + step - 1.0 / coarse as f64));
+        let (_, near) = best(1.0, coarse * (MAX_PERIODS - 1), coarse);
+        let (share, count) = best(near - 1.0 / coarse as f64, 2 * fine / coarse, fine);
         let mut bands = Waves { count, of_view: vec![[0.0; 2]; names.len()] };
         for _ in 0..if share < MIN_SHARE { 0 } else { ROUNDS } {
             let (left, weights) = rows.left_by_exposures(Some(&rows.bands(&bands)));

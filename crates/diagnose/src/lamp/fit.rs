@@ -272,38 +272,68 @@ impl LampObservations {
 
     /// Removes from a column what a value for each point and, if asked, for each view explains, by weighted least
     /// squares. Returns the values of the views, with mean 0; without them, zeros.
+    ///
+    /// The points are eliminated; conjugate gradients, preconditioned by the weights of the views, solve for these.
     fn project(&self, column: &mut [f64], weights: &[f64], with_views: bool) -> Vec<Option<f64>> {
         const ROUNDS: usize = 60;
-        const PRECISION: f64 = 1e-4;
+        const PRECISION: f64 = 1e-5;
         let mut of_views = vec![0.0; self.views];
-        let mut total = vec![0.0; self.views];
-        self.view.iter().zip(weights).for_each(|(&view, weight)| total[view] += weight);
-        let unseen = |view: usize| with_views && total[view] <= 0.0;
-        for _ in 0..ROUNDS {
-            for rows in &self.groups {
-                let weighted = column[rows.clone()].iter().zip(&weights[rows.clone()]);
-                let [sum, weight] = weighted
-                    .fold([0.0; 2], |[sum, all], (one, weight)| [sum + weight * one, all + weight]);
-                column[rows.clone()].iter_mut().for_each(|one| *one -= sum / weight);
-            }
-            if !with_views {
-                break;
-            }
-            let mut change = vec![0.0; self.views];
-            for ((&view, one), weight) in self.view.iter().zip(column.iter()).zip(weights) {
-                change[view] += weight * one / total[view];
-            }
-            column.iter_mut().zip(&self.view).for_each(|(one, &view)| *one -= change[view]);
-            of_views.iter_mut().zip(&change).for_each(|(all, change)| *all += change);
-            if change.iter().all(|change| change.abs() < PRECISION) {
-                break;
-            }
+        self.less_points(column, weights);
+        if !with_views {
+            return of_views.into_iter().map(Some).collect();
         }
-        let seen = (0..self.views).filter(|&view| !unseen(view));
-        let mean =
-            seen.clone().map(|view| of_views[view]).sum::<f64>() / seen.count().max(1) as f64;
-        let value = |view: usize| (!unseen(view)).then(|| of_views[view] - mean);
+        let total = self.sums_of_views(&vec![1.0; weights.len()], weights);
+        let scaled = |sums: &[f64]| -> Vec<f64> {
+            let mean = |(sum, total): (&f64, &f64)| if *total > 0.0 { sum / total } else { 0.0 };
+            sums.iter().zip(&total).map(mean).collect()
+        };
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let mut left = self.sums_of_views(column, weights);
+        let mut means = scaled(&left);
+        let (mut direction, mut square) = (means.clone(), dot(&left, &means));
+        for _ in 0..ROUNDS {
+            let mut along: Vec<f64> = self.view.iter().map(|&view| direction[view]).collect();
+            self.less_points(&mut along, weights);
+            let curvature = dot(&direction, &self.sums_of_views(&along, weights));
+            let is_done = means.iter().all(|mean| mean.abs() < PRECISION);
+            if is_done || curvature <= f64::MIN_POSITIVE {
+                break;
+            }
+            let step = square / curvature;
+            column.iter_mut().zip(&along).for_each(|(one, along)| *one -= step * along);
+            of_views.iter_mut().zip(&direction).for_each(|(all, along)| *all += step * along);
+            left = self.sums_of_views(column, weights);
+            means = scaled(&left);
+            let before = std::mem::replace(&mut square, dot(&left, &means));
+            let kept = square / before;
+            direction
+                .iter_mut()
+                .zip(&means)
+                .for_each(|(along, mean)| *along = mean + kept * *along);
+        }
+        let seen = || (0..self.views).filter(|&view| total[view] > 0.0);
+        let mean = seen().map(|view| of_views[view]).sum::<f64>() / seen().count().max(1) as f64;
+        let value = |view: usize| (total[view] > 0.0).then(|| of_views[view] - mean);
         (0..self.views).map(value).collect()
+    }
+
+    /// Takes the weighted mean of each point from a column.
+    fn less_points(&self, column: &mut [f64], weights: &[f64]) {
+        for rows in &self.groups {
+            let weighted = column[rows.clone()].iter().zip(&weights[rows.clone()]);
+            let [sum, weight] = weighted
+                .fold([0.0; 2], |[sum, all], (one, weight)| [sum + weight * one, all + weight]);
+            column[rows.clone()].iter_mut().for_each(|one| *one -= sum / weight);
+        }
+    }
+
+    /// The weighted sum of a column in each view.
+    fn sums_of_views(&self, column: &[f64], weights: &[f64]) -> Vec<f64> {
+        let mut sums = vec![0.0; self.views];
+        for ((&view, one), weight) in self.view.iter().zip(column).zip(weights) {
+            sums[view] += weight * one;
+        }
+        sums
     }
 }
 
@@ -331,6 +361,7 @@ fn minimum(
     let start = slopes.each_ref().map(|slope| dot(slope, residuals));
     let mut found = from;
     for _ in 0..SWEEPS {
+        let before = found;
         for term in (0..TERMS).filter(|&term| is_on(term) && normal[term][term] > 0.0) {
             let moved: f64 = (0..TERMS)
                 .filter(|&other| is_on(other))
@@ -338,6 +369,9 @@ fn minimum(
                 .sum();
             let change = (start[term] - moved) / normal[term][term];
             found[term] = (found[term] + change).clamp(0.0, BOUNDS[term]);
+        }
+        if found == before {
+            break;
         }
     }
     found
