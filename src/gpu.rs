@@ -87,7 +87,7 @@ pub use statistics::{Resources, Statistic};
 pub use subgroups::SUBGROUP_VARIABLE;
 pub use submission::{PassTime, Submission};
 pub use supported::PUSH_VARIABLE;
-pub use tuning::{Sorting, TUNE_VARIABLE, Tile, TunedTile};
+pub use tuning::{BackwardForm, RecordSums, Sorting, TUNE_VARIABLE, Tile, TunedTile};
 
 use crate::{Error, Result};
 

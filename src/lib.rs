@@ -177,10 +177,11 @@ pub use {ash, glam};
 
 // The device.
 pub use gpu::{
-    Buffer, CooperativeMatrix, DeviceChoice, DeviceLimits, DeviceReport, FeatureStructs, Gpu,
-    HostAllocation, HostDevice, HostFrame, HostImage, HostRequirements, ImageFormat, ImageState,
-    MemoryBudget, MemoryFunctions, PassTime, PciAddress, Properties, QueueLock, Recorder,
-    Requirement, RequirementReport, Slice, Tile, check_physical_device, devices, require_features,
+    BackwardForm, Buffer, CooperativeMatrix, DeviceChoice, DeviceLimits, DeviceReport,
+    FeatureStructs, Gpu, HostAllocation, HostDevice, HostFrame, HostImage, HostRequirements,
+    ImageFormat, ImageState, MemoryBudget, MemoryFunctions, PassTime, PciAddress, Properties,
+    QueueLock, RecordSums, Recorder, Requirement, RequirementReport, Slice, Tile,
+    check_physical_device, devices, require_features,
 };
 #[cfg(feature = "train")]
 pub use gpu::{CheckReport, CheckedPass, Difference};

@@ -11,7 +11,9 @@ use serde_json::{Value, json};
 use super::scene::BenchScene;
 use super::{Bench, median, stages, total};
 use crate::Result;
-use crate::gpu::{Buffer, Properties, Resources, Sorting, Tile, TunedTile};
+use crate::gpu::{
+    BackwardForm, Buffer, Properties, RecordSums, Resources, Sorting, Tile, TunedTile,
+};
 use crate::splats::batches::GradientKind;
 use crate::splats::device::{DeviceGaussians, Layout, Upload};
 use crate::splats::render::{
@@ -25,7 +27,7 @@ const SIZES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8
 const SUBGROUPS: [u32; 3] = [1, 2, 4];
 const SHARED_PIXELS: u32 = 256;
 
-/// Lengths of segments, tried with the fastest tile. A processor has one segment.
+/// Lengths of segments, tried with the fastest tile and both places of sums. A processor has one form.
 const SEGMENTS: [u32; 5] = [0, 64, 128, 512, 1024];
 
 /// Sorts; processors have the first.
@@ -84,10 +86,10 @@ impl TileTimings {
             };
             let of_tiles = measured(&choices(device))?;
             let Some(choice) = fastest_of(&of_tiles) else { continue };
-            let of_segments = measured(&in_segments(device, choice))?;
-            let (tile, sorting) = fastest_of(&of_segments).unwrap_or(choice);
+            let of_forms = measured(&in_forms(device, choice))?;
+            let (tile, sorting) = fastest_of(&of_forms).unwrap_or(choice);
             fastest.push(TunedTile { channels: features.channels(), tile, sorting });
-            cases.extend(of_tiles.into_iter().chain(of_segments));
+            cases.extend(of_tiles.into_iter().chain(of_forms));
         }
         let file = bench.gpu.keep_tuned_tiles(&fastest)?;
         Ok(Self { cases, fastest, file })
@@ -142,10 +144,12 @@ fn choices(device: &Properties) -> Vec<(Tile, Sorting)> {
     tiles.flat_map(|tile| sorts.iter().map(move |&sorting| (tile, sorting))).collect()
 }
 
-/// A choice with every length of segments that a device tries.
-fn in_segments(device: &Properties, (tile, sorting): (Tile, Sorting)) -> Vec<(Tile, Sorting)> {
+/// A choice with every form of the backward pass that a device tries.
+fn in_forms(device: &Properties, (tile, sorting): (Tile, Sorting)) -> Vec<(Tile, Sorting)> {
     let lengths = if device.is_cpu { &[][..] } else { &SEGMENTS };
-    let tiles = lengths.iter().map(|&segment| Tile { segment: Some(segment), ..tile });
+    let of_length = |&segment| RecordSums::ALL.map(|sums| BackwardForm { segment, sums });
+    let forms = lengths.iter().flat_map(of_length);
+    let tiles = forms.map(|form| Tile { backward: Some(form), ..tile });
     tiles.filter(|tile| device.suits_tile(*tile)).map(|tile| (tile, sorting)).collect()
 }
 
@@ -382,16 +386,21 @@ mod tests {
     }
 
     #[test]
-    fn a_gpu_tries_every_length_of_segments_of_whole_subgroups() {
-        let segments = |subgroup_size, is_cpu| {
+    fn a_gpu_tries_every_form_of_the_backward_pass_that_suits_it() {
+        let segments = |subgroup_size, is_cpu, tried| {
             let device = Properties { subgroup_size, is_cpu, ..Properties::of_a_test() };
-            let choices = in_segments(&device, ([16, 16].into(), Sorting::Tiles));
+            let choices = in_forms(&device, ([16, 16].into(), Sorting::Tiles));
             assert!(choices.iter().all(|&(_, sorting)| sorting == Sorting::Tiles));
-            choices.iter().map(|(tile, _)| tile.segment.unwrap()).collect::<Vec<_>>()
+            let forms = choices.iter().filter_map(|(tile, _)| tile.backward);
+            let of_sums = forms.filter(|form| form.sums == tried);
+            of_sums.map(|form| form.segment).collect::<Vec<_>>()
         };
-        assert_eq!(segments(32, false), SEGMENTS);
-        assert_eq!(segments(128, false), [0, 128, 512, 1024]);
-        assert!(segments(8, true).is_empty());
+        for sums in RecordSums::ALL {
+            assert_eq!(segments(32, false, sums), SEGMENTS);
+            assert!(segments(8, true, sums).is_empty());
+        }
+        assert_eq!(segments(128, false, RecordSums::Shuffles), [0, 128, 512, 1024]);
+        assert!(segments(128, false, RecordSums::SharedMemory).is_empty());
     }
 
     #[test]

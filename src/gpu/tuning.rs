@@ -14,8 +14,9 @@ use crate::{Error, Result};
 /// The variable with the path of another file, or `off`: no file.
 pub const TUNE_VARIABLE: &str = "NIGHTSPLAT_TUNE";
 
-/// The pixels that a workgroup of the rasteriser renders, and how. In files: two to four numbers, in the order of the
-/// fields; without the last ones, a subgroup has the tile to itself, and the device decides on segments.
+/// The pixels that a workgroup of the rasteriser renders, and how. In files: two, three or five numbers, in the order
+/// of the fields; without the last ones, a subgroup has the tile to itself, and the device decides on the backward
+/// pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<u32>", into = "Vec<u32>")]
 pub struct Tile {
@@ -23,9 +24,32 @@ pub struct Tile {
     pub size: [u32; 2],
     /// The number of subgroups, each of which has a part, one above the other: 1, 2 or 4.
     pub subgroups: u32,
-    /// The splats of a segment of a tile's run, which the backward pass blends side by side: a multiple of the device's
-    /// lanes, or 0 for one segment. `None`: as suits the device.
-    pub segment: Option<u32>,
+    /// `None`: as suits the device.
+    pub backward: Option<BackwardForm>,
+}
+
+/// How the backward pass blends the run of a tile.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BackwardForm {
+    /// The splats of a segment of the run, which are blended side by side: a multiple of the device's lanes, or 0 for
+    /// one segment.
+    pub segment: u32,
+    /// Where the gradients of a splat are summed over the pixels of a subgroup.
+    pub sums: RecordSums,
+}
+
+/// Where values are summed over the lanes of a subgroup. In files: 0 or 1.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RecordSums {
+    /// By shuffles of registers.
+    Shuffles = 0,
+    /// In shared memory, for at most 32 lanes of a GPU.
+    SharedMemory = 1,
+}
+
+impl RecordSums {
+    /// Both.
+    pub const ALL: [Self; 2] = [Self::Shuffles, Self::SharedMemory];
 }
 
 impl Tile {
@@ -40,7 +64,7 @@ impl Tile {
 /// A tile of one subgroup.
 impl From<[u32; 2]> for Tile {
     fn from(size: [u32; 2]) -> Self {
-        Self { size, subgroups: 1, segment: None }
+        Self { size, subgroups: 1, backward: None }
     }
 }
 
@@ -51,31 +75,44 @@ impl TryFrom<Vec<u32>> for Tile {
         match numbers[..] {
             [width, height] => Ok([width, height].into()),
             [width, height, subgroups] => Ok(Self { subgroups, ..[width, height].into() }),
-            [width, height, subgroups, segment] => {
-                Ok(Self { size: [width, height], subgroups, segment: Some(segment) })
+            [width, height, subgroups, segment, sums @ 0..2] => {
+                let backward = Some(BackwardForm { segment, sums: RecordSums::ALL[sums as usize] });
+                Ok(Self { size: [width, height], subgroups, backward })
             }
-            _ => Err("a tile is its width and height in pixels, how many subgroups share it, and the splats of a \
-                      segment"
+            _ => Err("a tile is its width and height in pixels, how many subgroups share it, the splats of a segment, \
+                      and 1 for sums in shared memory or 0"
                 .to_owned()),
         }
     }
 }
 
 impl From<Tile> for Vec<u32> {
-    fn from(Tile { size: [width, height], subgroups, segment }: Tile) -> Self {
-        match segment {
-            Some(segment) => vec![width, height, subgroups, segment],
+    fn from(Tile { size: [width, height], subgroups, backward }: Tile) -> Self {
+        match backward {
+            Some(BackwardForm { segment, sums }) => {
+                vec![width, height, subgroups, segment, sums as u32]
+            }
             None if subgroups == 1 => vec![width, height],
             None => vec![width, height, subgroups],
         }
     }
 }
 
-/// `16x8`, `16x16x4` of four subgroups, or `16x16x4x128` in segments of 128 splats.
+/// `16x8`, `16x16x4` of four subgroups, or `16x16x4 in segments of 128, summed by shuffles`.
 impl fmt::Display for Tile {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let numbers: Vec<_> = Vec::from(*self).iter().map(u32::to_string).collect();
-        out.write_str(&numbers.join("x"))
+        let numbers = Vec::from(Self { backward: None, ..*self });
+        let numbers: Vec<_> = numbers.iter().map(u32::to_string).collect();
+        out.write_str(&numbers.join("x"))?;
+        let Some(BackwardForm { segment, sums }) = self.backward else { return Ok(()) };
+        match segment {
+            0 => out.write_str(" in one segment")?,
+            splats => write!(out, " in segments of {splats}")?,
+        }
+        out.write_str(match sums {
+            RecordSums::Shuffles => ", summed by shuffles",
+            RecordSums::SharedMemory => ", summed in shared memory",
+        })
     }
 }
 
@@ -123,8 +160,9 @@ struct Tuning {
 
 impl Properties {
     /// Whether subgroups can share such tiles: each part has 1 to 32 rows of lanes, lanes fill rows of pixels or the
-    /// reverse, all lanes fit a workgroup, the subgroups stay converged while others leave their loops, and a segment
-    /// has whole subgroups of splats. A software device runs one subgroup after the other.
+    /// reverse, all lanes fit a workgroup, the subgroups stay converged while others leave their loops, a segment has
+    /// whole subgroups of splats, and sums in shared memory take at most 16 kB, the least that devices have. A software
+    /// device runs one subgroup after the other.
     #[doc(hidden)]
     pub fn suits_tile(&self, tile: impl Into<Tile>) -> bool {
         let tile = tile.into();
@@ -135,12 +173,16 @@ impl Properties {
             let pixels = u64::from(width) * u64::from(height);
             let is_workgroup = lanes * u64::from(tile.subgroups) <= u64::from(WORKGROUP);
             let keeps_subgroups = self.has_uniform_subgroup_control_flow || self.is_cpu;
+            let suits_form = |BackwardForm { segment, sums }: BackwardForm| {
+                u64::from(segment).is_multiple_of(lanes)
+                    && (sums == RecordSums::Shuffles || lanes <= 32 && !self.is_cpu)
+            };
             (lanes_fill_rows || rows_fill_lanes)
                 && pixels.is_multiple_of(lanes)
                 && (1..=32).contains(&(pixels / lanes))
                 && is_workgroup
                 && (tile.subgroups == 1 || keeps_subgroups)
-                && u64::from(tile.segment.unwrap_or(0)).is_multiple_of(lanes)
+                && tile.backward.is_none_or(suits_form)
         })
     }
 }
@@ -271,9 +313,13 @@ mod tests {
         let wide = Properties { subgroup_size: 128, ..properties() };
         assert!(wide.suits_tile(shared([16, 16], 2)));
         assert!(!wide.suits_tile(shared([32, 16], 4)), "512 lanes");
-        let in_segments =
-            |segment| properties().suits_tile(Tile { segment: Some(segment), ..[16, 16].into() });
+        let in_form = |device: &Properties, segment, sums| {
+            let backward = Some(BackwardForm { segment, sums });
+            device.suits_tile(Tile { backward, ..[16, 16].into() })
+        };
+        let in_segments = |segment| in_form(&properties(), segment, RecordSums::SharedMemory);
         assert!(in_segments(0) && in_segments(64) && !in_segments(60));
+        assert_eq!(RecordSums::ALL.map(|sums| in_form(&wide, 128, sums)), [true, false]);
     }
 
     #[test]
@@ -281,13 +327,21 @@ mod tests {
         for (tile, text) in [
             (Tile::from([16, 8]), "[16,8]"),
             (shared([16, 16], 4), "[16,16,4]"),
-            (Tile { segment: Some(0), ..[16, 8].into() }, "[16,8,1,0]"),
+            (
+                Tile {
+                    backward: Some(BackwardForm { segment: 0, sums: RecordSums::SharedMemory }),
+                    ..[16, 8].into()
+                },
+                "[16,8,1,0,1]",
+            ),
         ] {
             assert_eq!(serde_json::to_string(&tile).unwrap(), text);
             assert_eq!(serde_json::from_str::<Tile>(text).unwrap(), tile);
         }
         assert_eq!(shared([16, 16], 4).to_string(), "16x16x4");
-        assert!(serde_json::from_str::<Tile>("[16]").is_err());
+        for wrong in ["[16]", "[16,8,1,0]", "[16,8,1,0,2]"] {
+            assert!(serde_json::from_str::<Tile>(wrong).is_err(), "{wrong}");
+        }
     }
 
     #[test]

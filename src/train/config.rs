@@ -183,10 +183,10 @@ pub struct TrainConfig {
     tensorboard: bool = false => Rule::Flag, "--tensorboard";
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu.
     device: String = String::new(), "the best" => Rule::Text("a device", |_| true), "--device DEVICE";
-    /// The tile that a workgroup renders: width and height in pixels, the number of subgroups that share it, and the
-    /// splats of a segment of the backward pass.
+    /// The tile that a workgroup renders: width and height in pixels, the number of subgroups that share it, the
+    /// splats of a segment of the backward pass, and 1 for its sums in shared memory or 0.
     tile: Option<Tile> = None, "the fastest known on the device; recorded"
-        => Rule::List(2, 4, &Rule::Whole(0, u32::MAX as u64));
+        => Rule::List(2, 5, &Rule::Whole(0, u32::MAX as u64));
     /// Near plane, in units of the scene extent: the distance of the cameras from their centre, rounded to a power of
     /// two.
     near: f64 = 0.1 => Rule::from_to(1e-6, 1.0), "--near N";

@@ -226,7 +226,7 @@ mod tests {
         refused("frame.scale=0", &["frame.scale is 0", "it must be at least"]);
         refused("patch_pixels=8", &["patch_pixels is 8", "at least 256"]);
         refused("cache=much", &["cache is \"much\"", "512M"]);
-        refused("tile=[8]", &["tile is [8]", "2 to 4 of"]);
+        refused("tile=[8]", &["tile is [8]", "2 to 5 of"]);
     }
 
     #[test]

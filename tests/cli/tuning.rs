@@ -2,7 +2,7 @@
 
 use crate::common::command::{Folder, json};
 use crate::common::prelude::*;
-use nightsplat::gpu::Tile;
+use nightsplat::gpu::{BackwardForm, RecordSums, Tile};
 use nightsplat::results::run;
 use serde_json::json;
 
@@ -53,7 +53,8 @@ fn built_in() -> Tile {
 
 /// A tile that the device supports and that is not the built-in one.
 fn unusual() -> Tile {
-    Tile { subgroups: 2, segment: Some(64), ..[16, 16].into() }
+    let backward = Some(BackwardForm { segment: 64, sums: RecordSums::Shuffles });
+    Tile { subgroups: 2, backward, ..[16, 16].into() }
 }
 
 #[test]
@@ -129,7 +130,7 @@ fn a_damaged_file_and_one_of_another_driver_are_ignored_with_one_line() {
 fn an_unsupported_tile_is_refused_with_the_remedy() {
     let workspace = workspace();
     for tile in
-        ["[3,3]", "[0,8]", "[4096,4096]", "[4294967295,4294967295]", "[16,16,3]", "[16,16,1,60]"]
+        ["[3,3]", "[0,8]", "[4096,4096]", "[4294967295,4294967295]", "[16,16,3]", "[16,16,1,60,0]"]
     {
         let train = format!("train @set --out @run --set tile={tile}");
         workspace.refused(&train, 2, &["tiles do not suit", "lanes", "take a tile of"]);

@@ -3,7 +3,7 @@
 
 use nightsplat::Error;
 use nightsplat::gpu::testing::{Defect, is_checked, with_defect};
-use nightsplat::gpu::{CheckReport, Sorting, Tile};
+use nightsplat::gpu::{BackwardForm, CheckReport, RecordSums, Sorting, Tile};
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
 use nightsplat::train::{Background, Part};
 use nightsplat_photographs::tone::Tone;
@@ -236,16 +236,20 @@ fn the_passes_of_long_runs_agree_with_their_references_in_segments() {
         }
         let mut setup = Setup::opaque_above(channels);
         (setup.settings.tile, setup.settings.trains_depth) = (Some(tile), trains_depth);
-        let [whole, segments] = [0, 1].map(|segment| {
-            let segment = Some(segment * lanes.max(16));
-            setup.settings.tile = Some(Tile { segment, ..tile });
-            assert_passes_agree(&setup)
-        });
+        let mut in_form = |segment, sums| {
+            let tile = Tile { backward: Some(BackwardForm { segment, sums }), ..tile };
+            setup.settings.tile = Some(tile);
+            gpu().properties().suits_tile(tile).then(|| assert_passes_agree(&setup))
+        };
+        let whole = in_form(0, RecordSums::Shuffles).unwrap();
         let largest = whole.parameters.iter().fold(0.0f32, |most, d| most.max(d.abs()));
-        for (whole, segments) in whole.parameters.iter().zip(&segments.parameters) {
-            assert!((whole - segments).abs() <= 1e-5 * largest, "{tile}: {whole} {segments}");
+        for segments in RecordSums::ALL.into_iter().filter_map(|sums| in_form(lanes.max(16), sums))
+        {
+            for (whole, segments) in whole.parameters.iter().zip(&segments.parameters) {
+                assert!((whole - segments).abs() <= 1e-5 * largest, "{tile}: {whole} {segments}");
+            }
+            assert_eq!(whole.visit_counts, segments.visit_counts);
         }
-        assert_eq!(whole.visit_counts, segments.visit_counts);
     }
 }
 
@@ -265,7 +269,8 @@ fn runs_of_whole_segments_and_of_one_splat_more_or_less_agree_with_their_referen
         }
         assert_eq!(setup.render().renderer.intersections().unwrap(), 2 * count);
         let [whole, segments] = [0, length].map(|segment| {
-            setup.settings.tile = Some(Tile { segment: Some(segment), ..tile_of(([16, 16], 1)) });
+            let backward = Some(BackwardForm { segment, sums: RecordSums::Shuffles });
+            setup.settings.tile = Some(Tile { backward, ..tile_of(([16, 16], 1)) });
             assert_passes_agree(&setup).parameters
         });
         let largest = whole.iter().fold(0.0f32, |most, d| most.max(d.abs()));

@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 
 use glam::DVec4;
-use nightsplat::gpu::{Sorting, Tile};
+use nightsplat::gpu::{BackwardForm, RecordSums, Sorting, Tile};
 use nightsplat::kernels::ProjectedSplat;
 use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
@@ -227,18 +227,19 @@ fn counting_and_emitting_agree() {
 
 #[test]
 fn both_sorts_give_the_same_bits() {
-    for segment in [None, Some(64)] {
+    let form = BackwardForm { segment: 64, sums: RecordSums::Shuffles };
+    for backward in [None, Some(form)] {
         let [whole, tiles] = [Sorting::Whole, Sorting::Tiles].map(|sorting| {
             let mut setup = needles(3000);
             setup.settings.sorting = Some(sorting);
             let tile = setup.settings.tile_on(&gpu()).unwrap();
-            setup.settings.tile = Some(Tile { segment, ..tile });
+            setup.settings.tile = Some(Tile { backward, ..tile });
             let mut rendered = setup.render();
             let d_render: Vec<f32> = rendered.render.iter().map(|value| value - 0.5).collect();
             let gradients = rendered.backward(&d_render);
             (rendered.render.clone(), rendered.transmittances.clone(), gradients)
         });
-        assert!(whole == tiles, "{segment:?}");
+        assert!(whole == tiles, "{backward:?}");
     }
 }
 

@@ -284,8 +284,9 @@ fn possible_lenses(model: &Path, photos: &Path) -> Result<Vec<Lens>> {
     let lenses = Dataset::lenses(model)?;
     if let Some(problem) = cameras::mostly_impossible(&lenses) {
         let problem = format!(
-            "COLMAP's calibration cannot be, {problem}; mask what moves with the camera (masks/ beside the photographs), take \
-             more of them, closer together, or try --camera-model SIMPLE_RADIAL, which has one focal length"
+            "COLMAP's calibration cannot be, {problem}; mask what moves with the camera (masks/ beside the \
+             photographs), take more of them, closer together, or try --camera-model SIMPLE_RADIAL, which has one \
+             focal length"
         );
         return Err(Error::input(photos, problem));
     }

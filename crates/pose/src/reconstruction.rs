@@ -207,9 +207,9 @@ impl<'a> Reconstruction<'a> {
     /// If most of the dark photographs have no camera, learned features are tried where this COLMAP has them, and kept
     /// if they give more. If more than a tenth have none, all are matched again, guided: without it, the result of a
     /// small set depends on chance; always matching guided would double the time of a large one. If most still have
-    /// none, the choice of the initial pair is relaxed. Cameras whose calibration cannot be count as none: the same
-    /// photographs have another one in most further attempts. All of this together takes [`PoseOptions::patience`] times the
-    /// time of the first attempt at most. Stages that an earlier call has done are not repeated.
+    /// none, the choice of the initial pair is relaxed. Cameras whose calibration cannot be count as none: another
+    /// attempt mostly finds another one. All of this together takes [`PoseOptions::patience`] times the time of the
+    /// first attempt at most. Stages that an earlier call has done are not repeated.
     pub(super) fn models(
         mut self,
         pictures: &PosePhotographs,

@@ -4,7 +4,7 @@ use glam::UVec2;
 
 use super::buffers::color_floats;
 use super::{Purpose, RenderSettings};
-use crate::gpu::{Gpu, Properties, Tile};
+use crate::gpu::{BackwardForm, Gpu, Properties, RecordSums, Tile};
 use crate::kernels::ProjectedSplat;
 use crate::{Error, Result};
 
@@ -14,14 +14,17 @@ pub(super) fn splats_per_turn(gpu: &Gpu) -> u32 {
     if gpu.properties().max_loop_iterations < u32::MAX { 2 } else { 1 }
 }
 
-/// 1 where the backward pass sums gradient records over the lanes in shared memory, 0 where by shuffles.
+/// Where the backward pass sums gradient records over the lanes.
 ///
 /// A record of three channels takes 12 shuffles. On NVIDIA each is an instruction of the units for loads, and a lane
 /// that sums a value of its own takes a third fewer instructions. AMD and Intel read another lane's register within an
 /// addition, and on AMD the memory would leave room for a third of the subgroups. A CPU has its splats in registers.
-pub(super) fn sums_in_shared_memory(device: &Properties) -> u32 {
+fn record_sums(device: &Properties) -> RecordSums {
     const NVIDIA: u32 = 0x10de;
-    u32::from(device.vendor == NVIDIA && !device.is_cpu)
+    match device.vendor {
+        NVIDIA if !device.is_cpu => RecordSums::SharedMemory,
+        _ => RecordSums::Shuffles,
+    }
 }
 
 /// The splats of a segment of a tile's run on a GPU, where the last splats of a long run would wait for all before them
@@ -30,16 +33,17 @@ pub(super) fn sums_in_shared_memory(device: &Properties) -> u32 {
 const SEGMENT: u32 = 1024;
 const SEGMENT_OF_SHARED_TILE: u32 = 128;
 
-/// The splats of a segment; 0: a run has one segment.
-pub(super) fn segment_length(gpu: &Properties, purpose: Purpose, tile: Tile) -> u32 {
-    let built_in = match tile.subgroups {
-        _ if gpu.is_cpu => 0,
+/// The form of the backward pass; a draw without one has no states between segments.
+pub(super) fn backward_form(device: &Properties, purpose: Purpose, tile: Tile) -> BackwardForm {
+    let segment = match tile.subgroups {
+        _ if device.is_cpu => 0,
         1 => SEGMENT,
         _ => SEGMENT_OF_SHARED_TILE,
     };
+    let form = tile.backward.unwrap_or(BackwardForm { segment, sums: record_sums(device) });
     match purpose {
-        Purpose::Train => tile.segment.unwrap_or(built_in),
-        Purpose::Show => 0,
+        Purpose::Train => form,
+        Purpose::Show => BackwardForm { segment: 0, ..form },
     }
 }
 
@@ -143,11 +147,11 @@ mod tests {
 
     #[test]
     fn records_are_summed_in_shared_memory_on_nvidia_alone() {
-        for (vendor, is_cpu, expected) in
-            [(0x10de, false, 1), (0x1002, false, 0), (0x8086, false, 0), (0x10de, true, 0)]
-        {
-            let device = Properties { vendor, is_cpu, ..Properties::of_a_test() };
-            assert_eq!(sums_in_shared_memory(&device), expected, "{vendor:x} {is_cpu}");
+        let sums =
+            |vendor, is_cpu| record_sums(&Properties { vendor, is_cpu, ..Properties::of_a_test() });
+        assert_eq!(sums(0x10de, false), RecordSums::SharedMemory);
+        for (vendor, is_cpu) in [(0x1002, false), (0x8086, false), (0x10de, true)] {
+            assert_eq!(sums(vendor, is_cpu), RecordSums::Shuffles, "{vendor:x} {is_cpu}");
         }
     }
 }

@@ -8,9 +8,9 @@ use nightsplat_models::gaussians::Shape;
 
 use super::buffers::{RANKS_PER_PARTITION, RenderBuffers, Segments};
 use super::lamp::DeviceLamp;
-use super::limits::{longest_run, segment_length, splats_per_turn, sums_in_shared_memory};
+use super::limits::{backward_form, longest_run, splats_per_turn};
 use super::{Purpose, RenderSettings, Renderer, Sort};
-use crate::gpu::{Gpu, Pipeline, Sorting, Tile};
+use crate::gpu::{BackwardForm, Gpu, Pipeline, Sorting, Tile};
 use crate::kernels::camera::CAMERA_ORTHOGRAPHIC;
 use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
@@ -48,7 +48,7 @@ impl Renderer {
 
     fn build(gpu: &Gpu, settings: RenderSettings, gradients: WrittenGradients) -> Result<Self> {
         let tile = settings.tile_on(gpu)?;
-        let segment = segment_length(gpu.properties(), settings.purpose, tile);
+        let segment = backward_form(gpu.properties(), settings.purpose, tile).segment;
         let [tile_width, tile_height] = tile.size;
         let channels = settings.trained_channels() as u32;
         if channels > MAX_CHANNELS {
@@ -114,9 +114,7 @@ impl Renderer {
             return Ok(());
         }
         if self.blend_backward.is_none() {
-            let segment = self.frame.segments.length;
-            self.blend_backward =
-                Some(blending_backward(gpu, settings, *tile, segment, *gradients)?);
+            self.blend_backward = Some(blending_backward(gpu, settings, *tile, *gradients)?);
         }
         if let Some(Projections { backward: backward @ None, .. }) = self.projections.get_mut(&kind)
         {
@@ -297,10 +295,11 @@ fn blending(
 fn blending_backward(
     gpu: &Gpu,
     settings: &RenderSettings,
-    Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile, .. }: Tile,
-    segment: u32,
+    tile: Tile,
     gradients: WrittenGradients,
 ) -> Result<Pipeline<blend_backward::Kernel>> {
+    let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile, .. } = tile;
+    let BackwardForm { segment, sums } = backward_form(gpu.properties(), settings.purpose, tile);
     gpu.pipeline(&blend_backward::Constants {
         alpha_max: settings.max_alpha,
         channels: settings.trained_channels() as u32,
@@ -310,7 +309,7 @@ fn blending_backward(
         view_depths: settings.keeps_depth().into(),
         skips_groups: !gpu.properties().is_cpu,
         splats_per_turn: splats_per_turn(gpu),
-        sums_in_shared_memory: sums_in_shared_memory(gpu.properties()),
+        sums_in_shared_memory: sums as u32,
         subgroups_per_tile,
         segment,
     })

@@ -140,9 +140,11 @@ impl RenderSettings {
             1 => "",
             _ => " of each of 1, 2 or 4 subgroups",
         };
-        let of = match tile.segment {
+        let of = match tile.backward {
             None => of.to_owned(),
-            Some(_) => format!("{of}, with segments of a multiple of {lanes} splats"),
+            Some(_) => format!(
+                "{of}, segments of a multiple of {lanes} splats, and shared memory on GPUs of at most 32 lanes"
+            ),
         };
         let remedy = format!("1 to 32 times {lanes} pixels{of}; without `tile` the device chooses");
         let problem = format!("{tile} tiles do not suit {lanes} lanes");
