@@ -115,18 +115,16 @@ void lamp_lit_backward(vec3 point, vec3 lit, inout vec3 d_color, inout vec3 d_po
     d_point += d_log_factor * lamp_point_gradient(loaded, at);
 }
 
-// The gradient of ln factor, from that of the colour without the lamp.
-float lamp_log_factor_gradient(Lamp loaded, LampPoint at, vec3 lit, vec3 d_color) {
-    float factor = lamp_factor(loaded, at), d = 0.0;
+// Adds the gradient of the learned numbers, from that of the colour without the lamp, which is black + tone(x): a lit
+// colour is black + tone(factor x).
+void lamp_add_gradient(Lamp loaded, vec3 point, vec3 lit, vec3 d_color, inout float sums[LAMP_WIDTH]) {
+    LampPoint at = lamp_at(loaded, point);
+    float factor = lamp_factor(loaded, at), d_log_factor = 0.0;
     for (uint c = 0; c < 3; c++) {
         float x = lamp_tone_inverse(loaded, lit[c] - loaded.black) / factor;
-        d += d_color[c] * x * lamp_tone_slope(loaded, x);
+        d_log_factor += d_color[c] * x * lamp_tone_slope(loaded, x);
     }
-    return d;
-}
-
-// The gradient of ln factor with respect to the learned numbers.
-void lamp_gradient(Lamp loaded, LampPoint at, out float gradient[LAMP_WIDTH]) {
+    float gradient[LAMP_WIDTH];
     float share = loaded.slope * lamp_share(loaded, at), turn = share * lamp_turn(loaded, at);
     vec3 d_position = -LAMP_STEP * loaded.reference_distance * lamp_point_gradient(loaded, at);
     vec3 d_axis = at.radius > LAMP_FARTHEST * loaded.reference_distance ? vec3(0.0) : turn * at.towards;
@@ -141,4 +139,5 @@ void lamp_gradient(Lamp loaded, LampPoint at, out float gradient[LAMP_WIDTH]) {
     gradient[LAMP_FALLOFFS] = -share * at.away * LAMP_FALLOFF_STEP * sigmoid(lamp[LAMP_FALLOFFS]);
     gradient[LAMP_FALLOFFS + 1] =
         -share * at.away * at.away * LAMP_FALLOFF_STEP * sigmoid(lamp[LAMP_FALLOFFS + 1]);
+    [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) sums[n] += d_log_factor * gradient[n];
 }

@@ -28,14 +28,9 @@ impl ReferenceLamp {
         Self { lamp: Lamp::of_numbers(&numbers), numbers }
     }
 
-    /// The factor on the argument of the tone law at a point in view space.
-    pub fn factor(&self, point: DVec3) -> f64 {
-        self.lamp.factor(point)
-    }
-
     /// The colour at a point in view space, before it is clamped.
     pub fn lit(&self, color: DVec3, point: DVec3) -> DVec3 {
-        let factor = self.factor(point);
+        let factor = self.lamp.factor(point);
         color.map(|value| self.lamp.tone(factor * self.lamp.tone_inverse(value)))
     }
 
@@ -44,23 +39,33 @@ impl ReferenceLamp {
         if reach == 0.0 || x < 0.0 { 1.0 } else { (-(x / reach).min(LAMP_KNEE)).exp() }
     }
 
-    /// From the gradient of a lit colour to those of the colour without the lamp and of ln factor.
-    pub fn lit_backward(&self, lit: DVec3, d_lit: DVec3, point: DVec3) -> (DVec3, f64) {
-        let factor = self.factor(point);
+    /// From the gradient of a lit colour to those of the colour without the lamp and of the point.
+    pub fn lit_backward(&self, lit: DVec3, d_lit: DVec3, point: DVec3) -> (DVec3, DVec3) {
+        let factor = self.lamp.factor(point);
         let x = lit.map(|value| self.lamp.tone_inverse(value));
         let d_x = d_lit * x.map(|x| self.tone_slope(x));
-        (factor * d_x / (x / factor).map(|x| self.tone_slope(x)), d_x.dot(x))
-    }
-
-    /// The gradient of ln factor, from that of the colour without the lamp.
-    pub fn log_factor_gradient(&self, lit: DVec3, d_color: DVec3, point: DVec3) -> f64 {
-        let x = lit.map(|value| self.lamp.tone_inverse(value)) / self.factor(point);
-        d_color.dot(x * x.map(|x| self.tone_slope(x)))
+        let d_color = factor * d_x / (x / factor).map(|x| self.tone_slope(x));
+        (d_color, d_x.dot(x) * self.point_gradient(point))
     }
 
     /// A bound of the relative change of a lit colour, and of its gradient, over that of the colour.
-    pub(super) fn steepness(&self) -> f64 {
+    fn steepness(&self) -> f64 {
         if self.lamp.reach == 0.0 { 1.0 } else { 1.0 / LAMP_LEFT }
+    }
+
+    /// The rounding error of a lit colour, given that of the colour, in units of one rounding.
+    pub(super) fn lit_error(&self, error: f64, point: DVec3) -> f64 {
+        let relative = 1.0 + self.factor_error(point) / UNIT;
+        self.steepness() * self.lamp.factor(point) * relative * error
+    }
+
+    /// The rounding errors of the gradient of the point, and of that of the colour, relative.
+    pub(super) fn lit_backward_error(&self, lit: DVec3, d_lit: DVec3, point: DVec3) -> [f64; 2] {
+        let x = lit.map(|value| self.lamp.tone_inverse(value));
+        let d_log_factor = d_lit.abs().dot(x * x.map(|x| self.tone_slope(x)));
+        let rounded = self.steepness() * d_lit.abs().dot(DVec3::ONE + lit.abs());
+        let error = (d_log_factor.abs() + rounded) * self.point_gradient_error(point);
+        [error, self.steepness() * self.factor_error(point)]
     }
 
     /// The relative rounding error of the factor: exponentials and logarithms have errors of a few units in the last
@@ -82,7 +87,7 @@ impl ReferenceLamp {
     }
 
     /// The gradient of ln factor with respect to the point.
-    pub fn point_gradient(&self, point: DVec3) -> DVec3 {
+    fn point_gradient(&self, point: DVec3) -> DVec3 {
         let at = self.lamp.at(point);
         let Lamp { exponent, reference_distance, slope, .. } = self.lamp;
         if at.length > LAMP_FARTHEST {
@@ -97,7 +102,7 @@ impl ReferenceLamp {
     }
 
     /// The rounding error of [`ReferenceLamp::point_gradient`], whose terms can cancel.
-    pub(super) fn point_gradient_error(&self, point: DVec3) -> f64 {
+    fn point_gradient_error(&self, point: DVec3) -> f64 {
         let at = self.lamp.at(point);
         let Lamp { exponent, falloffs: [first, second], reference_distance, slope, .. } = self.lamp;
         let terms = exponent + 2.0 * first + 8.0 * second;
@@ -105,8 +110,10 @@ impl ReferenceLamp {
             / (at.distance * reference_distance)
     }
 
-    /// The gradient of ln factor with respect to the learned numbers.
-    pub fn gradient(&self, point: DVec3) -> [f64; WIDTH] {
+    /// The gradient of the learned numbers, from that of the colour without the lamp.
+    pub fn gradient(&self, lit: DVec3, d_color: DVec3, point: DVec3) -> [f64; WIDTH] {
+        let x = lit.map(|value| self.lamp.tone_inverse(value)) / self.lamp.factor(point);
+        let d_log_factor = d_color.dot(x * x.map(|x| self.tone_slope(x)));
         let (lamp, at) = (&self.lamp, self.lamp.at(point));
         let share = lamp.slope * self.share(&at);
         let d_position = -LAMP_STEP * lamp.reference_distance * self.point_gradient(point);
@@ -132,5 +139,6 @@ impl ReferenceLamp {
             -share * at.away * LAMP_FALLOFF_STEP * rising(LAMP_FALLOFFS),
             -share * at.away * at.away * LAMP_FALLOFF_STEP * rising(LAMP_FALLOFFS + 1),
         ]
+        .map(|number| d_log_factor * number)
     }
 }

@@ -22,8 +22,7 @@ fn share(camera: &ReferenceCamera, inputs: &[f64]) -> Vec<f64> {
     let (point, lamp) =
         (camera.view(DVec3::from_slice(gaussian)), ReferenceLamp::from_numbers(numbers));
     let [lit, d_dc] = [3, 6].map(|at| DVec3::from_slice(&gaussian[at..]));
-    let d = lamp.log_factor_gradient(lit, d_dc / SH_C0, point);
-    lamp.gradient(point).map(|number| d * number).to_vec()
+    lamp.gradient(lit, d_dc / SH_C0, point).to_vec()
 }
 
 /// The shares of Gaussian `i`, with their rounding errors; `None` if it has none.

@@ -283,11 +283,8 @@ impl<'a> ProjectionInputs<'a> {
         // Sixteen terms, whose basis is a polynomial of magnitude 3 and degree 3.
         let color = 128.0 * (1.0 + gaussian.sh.iter().map(|c| c.abs().max_element()).sum::<f64>());
         let point = self.camera.view(gaussian.mean);
-        let lit = |lamp: ReferenceLamp| {
-            let relative = 1.0 + lamp.factor_error(point) / UNIT;
-            lamp.steepness() * lamp.factor(point) * relative * color
-        };
-        let color = self.lamp.map_or(color, lit) * self.tint.truncate().max_element().max(1.0);
+        let color = self.lamp.map_or(color, |lamp| lamp.lit_error(color, point))
+            * self.tint.truncate().max_element().max(1.0);
         let far = far * self.camera.rotation.x_axis.length().max(1.0);
         let dimmed = 32.0 * projection.conditioning;
         let level = f64::from(splat_level(opacity as f32));

@@ -95,12 +95,9 @@ pub fn project_gaussian_backward(
     let axes = [DVec3::X, DVec3::Y, DVec3::Z];
     d_mean_in_view +=
         d_splat.depth * DVec3::from_array(axes.map(|axis| camera.depth_change(mean_in_view, axis)));
-    let mut d_color = d_splat.color;
-    if let Some(Lit { lamp, color }) = lit {
-        let d_log_factor;
-        (d_color, d_log_factor) = lamp.lit_backward(color, d_color, mean_in_view);
-        d_mean_in_view += d_log_factor * lamp.point_gradient(mean_in_view);
-    }
+    let unlit = |Lit { lamp, color }| lamp.lit_backward(color, d_splat.color, mean_in_view);
+    let (d_color, d_point) = lit.map_or((d_splat.color, DVec3::ZERO), unlit);
+    d_mean_in_view += d_point;
 
     let (d_mean_sh, d_sh) =
         sh_backward(sh_degree, &gaussian.sh, gaussian.mean - camera.center(), d_color);
@@ -267,16 +264,6 @@ impl<'a> BackwardInputs<'a> {
         self.lamp.map_or(d_lit, |lamp| lamp.lit_backward(lit, d_lit, point).0)
     }
 
-    /// The rounding errors of what the lamp adds to the gradient of the mean, and of its factor, relative.
-    fn lamp_error(&self, gaussian: &Gaussian, d_color: DVec3, color: DVec3) -> [f64; 2] {
-        let Some(lamp) = &self.lamp else { return [0.0; 2] };
-        let point = self.camera.view(gaussian.mean);
-        let (_, d_log_factor) = lamp.lit_backward(color, d_color.abs(), point);
-        let rounded = lamp.steepness() * d_color.abs().dot(DVec3::ONE + color.abs());
-        let error = (d_log_factor.abs() + rounded) * lamp.point_gradient_error(point);
-        [error, lamp.steepness() * lamp.factor_error(point)]
-    }
-
     /// Columns of gradients that are written; those of the colour are the first ones of their plane.
     fn written_columns(&self) -> usize {
         let Planes { feature_count, sh_degree, .. } = self.planes;
@@ -426,7 +413,10 @@ impl Reference for Kernel {
             scene.store(&gradient, i, |at, value| gradients[at] = OFF * value.abs());
             let mut moved = one.load(&bounds, 0);
             // A basis is a polynomial of magnitude 3 and degree 3, which may vanish.
-            let [by_lamp, factor] = scene.lamp_error(&gaussian, d_splat.color, color);
+            let point = scene.camera.view(gaussian.mean);
+            let [by_lamp, factor] = scene
+                .lamp
+                .map_or([0.0; 2], |lamp| lamp.lit_backward_error(color, d_splat.color, point));
             moved.mean += by_lamp;
             let d_color = scene.d_color(&gaussian, d_splat.color, color);
             let basis = (64.0 * UNIT + factor) * d_color.abs();

@@ -200,9 +200,9 @@ impl<'a> Chain<'a> {
             );
             if let Some(Lit { lamp, color }) = lit {
                 let point = camera.view(gaussian.mean);
-                let share = lamp.gradient(point);
-                let (_, d_log_factor) = lamp.lit_backward(color, d_splat.color, point);
-                (results.lamp.iter_mut().zip(share)).for_each(|(sum, d)| *sum += d_log_factor * d);
+                let (d_color, _) = lamp.lit_backward(color, d_splat.color, point);
+                let gradient = lamp.gradient(color, d_color, point);
+                results.lamp.iter_mut().zip(gradient).for_each(|(sum, d)| *sum += d);
             }
             planes.store(&d, i, |at, value| results.gradient[at] = value);
             let GradientNorm { damping_weight, damping_depth, .. } = Rendered::norm(false);

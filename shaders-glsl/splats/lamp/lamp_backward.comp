@@ -9,10 +9,9 @@
 
 //! Lamp backward: the sums of the gradients of the lamp's numbers over chunks of Gaussians, after `project_backward`.
 //!
-//! Without the lamp a colour is black + tone(x), and lit it is black + tone(factor x): the gradient of ln factor is
-//! that of the unlit colour times x d tone / dx. `project_backward` has written SH_C0 times that of the unlit colour,
-//! as the gradient of the coefficients of degree 0. It is 0 for a Gaussian that the view does not show. A subgroup sums
-//! `CHUNK` Gaussians in a fixed order: the partition of a sum does not depend on the device.
+//! `project_backward` has written SH_C0 times the gradient of the unlit colour, as that of the coefficients of degree
+//! 0. It is 0 for a Gaussian that the view does not show. A subgroup sums `CHUNK` Gaussians in a fixed order: the
+//! partition of a sum does not depend on the device.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -47,11 +46,8 @@ void main() {
         vec3 d_dc = vec3(gradients[dc], gradients[dc + 1], gradients[dc + 2]);
         if (d_dc == vec3(0.0)) continue;
         vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
-        LampPoint at = lamp_at(loaded, cameras[camera_index].view_from_world * vec4(mean, 1.0));
-        float d = lamp_log_factor_gradient(loaded, at, colors[COLOR_VECTORS * i].rgb, d_dc / SH_C0);
-        float gradient[LAMP_WIDTH];
-        lamp_gradient(loaded, at, gradient);
-        [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) sums[n] += d * gradient[n];
+        vec3 point = cameras[camera_index].view_from_world * vec4(mean, 1.0);
+        lamp_add_gradient(loaded, point, colors[COLOR_VECTORS * i].rgb, d_dc / SH_C0, sums);
     }
     [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) {
         float sum = subgroup_sum(sums[n]);
