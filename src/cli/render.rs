@@ -277,15 +277,11 @@ pub fn run(args: &RenderArgs) -> Result<()> {
         return Err(Error::Usage(problem).into());
     }
     args.video.iter().chain(&args.out).try_for_each(|path| check_writable(path))?;
-    let FinishedRun { config, dataset, mut model_renderer, lamp, .. } =
+    let FinishedRun { config, dataset, mut model_renderer, .. } =
         FinishedRun::open(run, args.dataset.as_deref(), &opener(device.as_ref()))?;
-    if args.lamp {
-        let missing = || {
-            let problem =
-                "has no lamp (lamp.json): its model has not the part lamp; leave out --lamp";
-            Error::input(run, problem)
-        };
-        model_renderer.set_lamp(Some(lamp.ok_or_else(missing)?))?;
+    if args.lamp && !model_renderer.light_as(run, 1.0)? {
+        let problem = "has no lamp (lamp.json): its model has not the part lamp; leave out --lamp";
+        return Err(Error::input(run, problem).into());
     }
     let exposures = if *view_exposure { Some(ViewExposures::load(run)?) } else { None };
     let (shots, fps) = shots(args, &config, &dataset)?;

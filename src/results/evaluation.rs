@@ -78,9 +78,8 @@ impl RunEvaluation {
         };
         let opened = FinishedRun::open_with(run, options.dataset, &options.opener, change)?;
         let states_targets = opened.states_targets;
-        let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, lamp, .. } =
-            opened;
-        model_renderer.set_lamp(lamp)?;
+        let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, .. } = opened;
+        let is_lit = model_renderer.light_as(run, 1.0)?;
         let lpips = options.lpips.map(|(weights, range)| Lpips::load(&gpu, weights, range));
         let lpips = lpips.transpose()?;
         let scene = options.photographs.then(|| SceneTone::measure(&config.tone, &dataset));
@@ -118,7 +117,7 @@ impl RunEvaluation {
             Ok(())
         };
         let mut evaluation = Evaluation::new(&mut reference, &dataset, &extras, render, keep)?;
-        if lamp.is_some() && pictures.is_none() {
+        if is_lit && pictures.is_none() {
             evaluation.add_lit(&dataset, |view| model_renderer.render(view))?;
         }
         if pictures.is_none() {

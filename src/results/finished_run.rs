@@ -10,7 +10,6 @@ use nightsplat_photographs::tone::{ToneCurve, ToneSettings};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval::ModelRenderer;
 use crate::results::{models, run};
-use crate::splats::lamp::Lamp;
 use crate::splats::model::Model;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
@@ -39,9 +38,8 @@ pub(crate) struct FinishedRun {
     pub(crate) config: TrainConfig,
     pub(crate) dataset: Dataset,
     pub(crate) gaussian_count: usize,
+    /// Evenly lit.
     pub(crate) model_renderer: ModelRenderer,
-    /// The lamp that lit the photographs, in units of the dataset's world; renders are evenly lit.
-    pub(crate) lamp: Option<Lamp>,
     /// Whether the targets are known: those of a run, or of a file that states them.
     pub(crate) states_targets: bool,
 }
@@ -84,7 +82,6 @@ impl FinishedRun {
             let steps = config.steps;
             tracing::warn!("{}: incomplete, at step {step} of {steps}", folder.display());
         }
-        let lamp = run::load_lamp(folder)?;
         let gpu = opener.open(&config)?;
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
         if let Some(difference) = run::other_views(folder, &dataset).filter(|_| is_comparable) {
@@ -100,7 +97,6 @@ impl FinishedRun {
                 &config,
                 run::load_networks(&gpu, folder, &config.model, model.gaussians.shape.features)?,
             )?,
-            lamp,
             states_targets: true,
             config,
             gpu,
@@ -115,7 +111,7 @@ impl FinishedRun {
         change: impl FnOnce(&mut TrainConfig),
     ) -> Result<Self> {
         let mut run = Self::open_with(folder, dataset, opener, change)?;
-        run.model_renderer.set_lamp(run.lamp)?;
+        run.model_renderer.light_as(folder, 1.0)?;
         Ok(run)
     }
 
@@ -140,15 +136,7 @@ impl FinishedRun {
         let model = Model::of_shown(gaussians, &ModelFacts { near, ..facts });
         let model_renderer = ModelRenderer::new(&gpu, &model, &config, None)?;
         let gaussian_count = model.gaussians.count;
-        Ok(Self {
-            gpu,
-            config,
-            dataset,
-            gaussian_count,
-            model_renderer,
-            lamp: None,
-            states_targets,
-        })
+        Ok(Self { gpu, config, dataset, gaussian_count, model_renderer, states_targets })
     }
 }
 

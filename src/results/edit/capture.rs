@@ -95,9 +95,8 @@ impl ModelPhotographs {
             None => None,
         };
         let mut model_renderer = ModelRenderer::new(gpu, &model, &config, networks)?;
-        let lamp = run.map(run::load_lamp).transpose()?.flatten();
-        if !score_reference.is_evenly_lit(dataset) {
-            model_renderer.set_lamp(lamp.map(|lamp| lamp.scaled(placement.scale)))?;
+        if let Some(run) = run.filter(|_| !score_reference.is_evenly_lit(dataset)) {
+            model_renderer.light_as(run, placement.scale)?;
         }
         let render = |view: &View| model_renderer.render_camera(&placement.camera(&view.camera));
         let evaluation =

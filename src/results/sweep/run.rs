@@ -55,7 +55,7 @@ impl SweepRun {
         let networks =
             run::load_networks(gpu, &self.folder, &config.model, model.gaussians.shape.features)?;
         let mut model_renderer = ModelRenderer::new(gpu, &model, &config, networks)?;
-        model_renderer.set_lamp(run::load_lamp(&self.folder)?)?;
+        model_renderer.light_as(&self.folder, 1.0)?;
         Ok(model_renderer.render(view)?.output().clone())
     }
 }
