@@ -65,6 +65,10 @@ compile() {
     local train=(train "$work/set" --out "$work/run" --overwrite --plan none --steps 2 --sh-degree 3)
     run "$1" "$nightsplat" "${train[@]}" --model plain --exposure on --set loss.opacity_weight=0.01 || return
     run "$1" "$nightsplat" "${train[@]}" --model plain --parts lamp,normals || return
+    # A given model of which colours alone are trained.
+    cp "$work/run/model.ply" "$work/model.ply" || return
+    local frozen=(--init "$work/model.ply" --freeze means,quats,scales,opacities)
+    run "$1" "$nightsplat" "${train[@]}" --model plain "${frozen[@]}" || return
     # The width of the presets, and the paper's.
     case $1 in
         navi31 | gfx1201)

@@ -24,6 +24,7 @@ fn config(parts: &[Part]) -> TrainConfig {
     config.schedule.sh_degree_interval = 8;
     set_small_parts(&mut config, parts);
     config.model.denoiser_crop = 16;
+    config.lamp.rates.after = 2;
     config
 }
 
