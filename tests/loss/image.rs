@@ -329,21 +329,6 @@ fn l1_and_ssim_agree_with_pytorch() {
 }
 
 #[test]
-fn the_gradient_is_the_weighted_sum_of_both_gradients() {
-    on_both_plans(|gpu| {
-        for (size, loss_region) in loss_regions() {
-            let images = images(size);
-            let [l1, ssim, both] = [0.0, 1.0, 0.3].map(|weight| {
-                evaluate_loss_region(gpu, weight, size, loss_region, &images).d_render
-            });
-            let expected: Vec<f32> =
-                l1.iter().zip(&ssim).map(|(l1, ssim)| 0.7 * l1 + 0.3 * ssim).collect();
-            assert_close("d_render", &both, &expected, 1e-6);
-        }
-    });
-}
-
-#[test]
 fn an_image_compared_with_itself_has_no_loss() {
     on_both_plans(|gpu| {
         let [_, target] = images([40, 30]);
@@ -352,26 +337,6 @@ fn an_image_compared_with_itself_has_no_loss() {
         assert!((outcome.ssim - 1.0).abs() < 1e-6, "{}", outcome.ssim);
         assert!(largest(&outcome.d_render) < 1e-6, "{}", largest(&outcome.d_render));
         assert_eq!(outcome.status, 0);
-    });
-}
-
-#[test]
-fn constant_images_have_the_ssim_of_their_means_away_from_the_border() {
-    on_both_plans(|gpu| {
-        let size = [64, 48];
-        let (a, b) = (0.5f32, 0.25f32);
-        let count = (3 * size[0] * size[1]) as usize;
-        let outcome = evaluate(gpu, 0.2, size, &[vec![a; count], vec![b; count]]);
-        assert!((outcome.l1 - 0.25).abs() < 1e-6);
-        // Zero padding changes the border; inside, variances vanish and (2ab + C1) / (a^2 + b^2 + C1) remains.
-        let inside = f64::from((2.0 * a * b + 1e-4) / (a * a + b * b + 1e-4));
-        let plane = [vec![f64::from(a); count / 3], vec![f64::from(b); count / 3]];
-        let map = ssim(size.map(|side| side as usize), &plane[0], &plane[1]);
-        assert!((map[24 * 64 + 32] - inside).abs() < 1e-6);
-        let mean = map.iter().sum::<f64>() / map.len() as f64;
-        // A variance is the difference of two numbers of up to 1/4, of which each may be rounded twice, over C2 = 9e-4.
-        let rounding = 4.0 * 0.25 * f64::from(f32::EPSILON) / 2.0 / 9e-4;
-        assert!((f64::from(outcome.ssim) - mean).abs() < rounding, "{} {mean}", outcome.ssim);
     });
 }
 

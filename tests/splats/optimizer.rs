@@ -267,19 +267,6 @@ fn log_scales_stay_where_exp_is_finite() {
     );
 }
 
-#[test]
-fn adam_finds_the_minimum_of_a_parabola() {
-    let mut planes = Planes::new(3);
-    planes.first.fill(0.0);
-    planes.second.fill(0.0);
-    planes.parameters.iter_mut().for_each(|p| *p *= 0.2);
-    for step in 1..=250 {
-        planes.gradients = planes.parameters.iter().map(|p| 2.0 * (p - 0.5)).collect();
-        planes.step(step, [3, COLUMNS], 0);
-    }
-    assert!(planes.parameters.iter().all(|p| (p - 0.5).abs() < 0.05), "{:?}", planes.parameters);
-}
-
 /// A kernel that ran anyway would write out of bounds.
 #[test]
 fn a_buffer_that_is_too_short_is_refused() {

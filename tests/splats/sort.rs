@@ -92,15 +92,17 @@ fn a_sort_by_any_number_of_bits_uses_only_those_bits() {
 
 #[test]
 fn equal_and_extreme_keys_keep_their_order() {
-    let gpu = gpu();
-    let mut sort = RadixSort::new(&gpu, 5000).unwrap();
-    for key in [0, 1, 0x0102_0408, u32::MAX] {
-        assert_sorts(&gpu, &mut sort, "equal keys", &[key; 5000], 5000, 32);
+    for is_cpu in [true, false] {
+        let gpu = gpu_with(|properties| properties.is_cpu = is_cpu);
+        let mut sort = RadixSort::new(&gpu, 5000).unwrap();
+        for key in [0, 1, 0x0102_0408, u32::MAX] {
+            assert_sorts(&gpu, &mut sort, "equal keys", &[key; 5000], 5000, 32);
+        }
+        let extremes: Vec<u32> = noise(5000).iter().map(|n| 0_u32.wrapping_sub(n & 1)).collect();
+        assert_sorts(&gpu, &mut sort, "0 and the maximum", &extremes, 5000, 32);
+        let descending: Vec<u32> = (0..5000).rev().collect();
+        assert_sorts(&gpu, &mut sort, "descending", &descending, 5000, 32);
     }
-    let extremes: Vec<u32> = noise(5000).iter().map(|n| 0_u32.wrapping_sub(n & 1)).collect();
-    assert_sorts(&gpu, &mut sort, "0 and the maximum", &extremes, 5000, 32);
-    let descending: Vec<u32> = (0..5000).rev().collect();
-    assert_sorts(&gpu, &mut sort, "descending", &descending, 5000, 32);
 }
 
 #[test]
@@ -112,20 +114,6 @@ fn a_sort_reads_its_count_on_the_device_and_stays_within_the_buffers() {
         // A larger count after a smaller one meets the tables that the smaller one left.
         for count in [0, 1, 1023, 2049, 8191, 8193, 3, 8999, 9000, 9001, u32::MAX] {
             assert_sorts(&gpu, &mut sort, "count", &keys, count, 32);
-        }
-    }
-}
-
-#[test]
-fn twenty_five_sorts_are_identical() {
-    for is_cpu in [true, false] {
-        let gpu = gpu_with(|properties| properties.is_cpu = is_cpu);
-        let mut sort = RadixSort::new(&gpu, 20_000).unwrap();
-        // Few distinct keys: a race between equal ones would change the values.
-        let keys: Vec<u32> = noise(20_000).iter().map(|n| n % 37 * 0x10_0001).collect();
-        let first = sorted(&gpu, &mut sort, &keys, 20_000, 24);
-        for _ in 1..25 {
-            assert!(sorted(&gpu, &mut sort, &keys, 20_000, 24) == first);
         }
     }
 }
