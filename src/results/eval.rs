@@ -15,8 +15,8 @@ use nightsplat_photographs::tone::{Statistics, ToneCurve, ToneSettings};
 
 use crate::gpu::Gpu;
 use crate::networks::lpips::Lpips;
-use crate::results::run::load_lamp;
 use crate::splats::device::{DeviceGaussians, Upload};
+use crate::splats::lamp::Lamp;
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::targets::Targets;
@@ -312,12 +312,9 @@ impl ModelRenderer {
         })
     }
 
-    /// Lights what is rendered from now on as the photographs of a run were, by its lamp, if it has one; whether it
-    /// has. A unit of the run's world is `units` of the model's.
-    pub(crate) fn light_as(&mut self, run: &Path, units: f64) -> Result<bool> {
-        let lamp = load_lamp(run)?;
-        self.renderer.set_lamp(lamp.map(|lamp| lamp.scaled(units * self.frame.scale)))?;
-        Ok(lamp.is_some())
+    /// Lights what is rendered from now on by a lamp at the camera, in units of the dataset's world, or evenly.
+    pub(crate) fn set_lamp(&mut self, lamp: Option<Lamp>) -> Result<()> {
+        self.renderer.set_lamp(lamp.map(|lamp| lamp.scaled(self.frame.scale)))
     }
 
     /// Renders a view as [`ScoreReference`] shows it: in the light of its photograph, or evenly lit.

@@ -73,10 +73,10 @@ impl Views {
         };
         let mut colors = init::colors_from_views(kept, &dataset.views, factor, |index| {
             let Some(photograph) = photographs[index] else { return Ok(None) };
-            let target = targets.next(photograph)?;
-            let exposure = exposures.and_then(|exposures| exposures.get(photograph.0));
-            let mut target =
-                exposure.map_or_else(|| target.clone(), |affine| affine.inverse().applied(&target));
+            let mut target = targets.next(photograph)?;
+            if let Some(affine) = exposures.and_then(|exposures| exposures.get(photograph.0)) {
+                target = affine.inverse().applied(&target);
+            }
             if let Some(lamp) = lamp {
                 let shown = |value: f32| lamp.tone_inverse(value.into()) as f32;
                 target.data.iter_mut().for_each(|value| *value = shown(*value));

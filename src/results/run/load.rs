@@ -15,6 +15,7 @@ use super::directory::view_lines;
 use super::files::{EXPOSURES, LAMP, NETWORKS, PLAN, TARGET_EXPOSURE, VIEWS};
 use super::generations;
 use crate::gpu::Gpu;
+use crate::results::eval::ModelRenderer;
 use crate::splats::lamp::Lamp;
 use crate::train::{ModelConfig, Networks, TrainConfig};
 use crate::{Error, Result};
@@ -135,6 +136,16 @@ pub fn load_lamp(run: &Path) -> Result<Option<Lamp>> {
     let lamp: Lamp = serde_json::from_str(&text).map_err(|error| refused(error.to_string()))?;
     lamp.check().map_err(|error| refused(error.to_string()))?;
     Ok(Some(lamp))
+}
+
+impl ModelRenderer {
+    /// Lights what is rendered from now on as the photographs of a run were, by its lamp, if it has one; whether it
+    /// has. A unit of the run's world is `units` of the model's.
+    pub(crate) fn light_as(&mut self, run: &Path, units: f64) -> Result<bool> {
+        let lamp = load_lamp(run)?;
+        self.set_lamp(lamp.map(|lamp| lamp.scaled(units)))?;
+        Ok(lamp.is_some())
+    }
 }
 
 /// The learned exposures of a run's training views relative to its model, by name; empty if none were learned.
