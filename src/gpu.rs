@@ -118,6 +118,8 @@ pub struct Properties {
     pub max_buffer_size: u64,
     /// Workgroups of a dispatch along one dimension.
     pub max_workgroups: u32,
+    /// Bytes of shared memory of a workgroup.
+    pub max_shared_memory: u32,
     /// Loop iterations, summed over all loops, after which an invocation silently leaves its loops.
     pub max_loop_iterations: u32,
     /// Valid bits of a timestamp on the queue; 0 where the queue has none, and passes cannot be timed.

@@ -403,6 +403,7 @@ fn properties(
             .min(supported.max_buffer_size()),
         max_buffer_size: supported.max_buffer_size(),
         max_workgroups: max_workgroups(&limits),
+        max_shared_memory: limits.max_compute_shared_memory_size,
         max_loop_iterations: match driver_id {
             vk::DriverId::MESA_LLVMPIPE => LLVMPIPE_LOOP_ITERATIONS,
             _ => u32::MAX,

@@ -142,9 +142,9 @@ impl RenderSettings {
         };
         let of = match tile.backward {
             None => of.to_owned(),
-            Some(_) => format!(
-                "{of}, segments of a multiple of {lanes} splats, and shared memory on GPUs of at most 32 lanes"
-            ),
+            Some(_) => {
+                format!("{of}, segments of a multiple of {lanes} splats, and sums by shuffles (0)")
+            }
         };
         let remedy = format!("1 to 32 times {lanes} pixels{of}; without `tile` the device chooses");
         let problem = format!("{tile} tiles do not suit {lanes} lanes");
