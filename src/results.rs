@@ -6,6 +6,7 @@
 //! - [`run`]: a training run, its events and its directory
 //! - [`run_facts`]: the summary of a run before its first step
 //! - [`sweep`]: the results of a sweep
+//! - [`toned`]: photographs through a tone curve
 //! - [`comparison`]: runs on one dataset, view by view
 //! - [`diagnosis`]: a diagnosis of photographs as a table and a page
 //! - [`evaluation`]: scores as a table, and the page of a run
@@ -27,5 +28,6 @@ pub mod run;
 pub mod run_export;
 pub mod run_facts;
 pub mod sweep;
+pub mod toned;
 pub mod verdict;
 pub mod view_exposures;

@@ -1,7 +1,8 @@
 //! `nightsplat tone`, in process.
 
 use clap::Parser as _;
-use nightsplat::cli::tone::apply::{ApplyArgs, ToneReport, apply};
+use nightsplat::cli::tone::apply::{ApplyArgs, apply};
+use nightsplat::results::toned::ToneReport;
 use nightsplat_photographs::image::srgb_from_linear;
 use nightsplat_photographs::metrics::psnr;
 

@@ -89,7 +89,9 @@ impl Attempt {
         if let Some((model, placed)) = Dataset::largest_model(models, is_dark)? {
             match cameras::mostly_impossible(&Dataset::lenses(&model)?) {
                 Some(problem) => {
-                    tracing::warn!("cameras without a possible calibration do not count, {problem}")
+                    tracing::warn!(
+                        "cameras without a possible calibration do not count, {problem}"
+                    );
                 }
                 None => attempt.placed = placed.iter().filter(|name| is_dark(name)).count(),
             }

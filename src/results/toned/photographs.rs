@@ -1,4 +1,4 @@
-//! The photographs that `tone apply` reads, and the files that it writes.
+//! The photographs that are mapped, and the files that they are written to.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -14,9 +14,7 @@ use nightsplat_photographs::image::{
 use nightsplat_photographs::tree;
 use nightsplat_photographs::white_balance::WhiteBalanceMatrix;
 
-use super::ApplyArgs;
-use crate::cli::OutputFormat;
-use crate::train::TrainConfig;
+use super::ToneRequest;
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -84,15 +82,15 @@ impl InputPhotograph {
 }
 
 /// The photographs of the input: a file, those of a folder by name, or those of a dataset.
-pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<InputPhotograph>> {
-    let input = &args.input;
+pub(super) fn listed(request: &ToneRequest<'_>) -> Result<Vec<InputPhotograph>> {
+    let &ToneRequest { input, reference, out, curve: (_, ref config), .. } = request;
     std::fs::metadata(input).map_err(|error| unreadable(input, &error))?;
-    let is_reduced = args.out.is_none();
+    let is_reduced = out.is_none();
     let mut photographs = if !tree::is_dir(input) {
-        vec![plain(input, args.reference.as_deref())?]
+        vec![plain(input, reference)?]
     } else if Dataset::is_at(input) {
         let loading = if is_reduced { measured_only() } else { LoadOptions::default() };
-        let options = LoadOptions { reference: args.reference.clone(), ..loading };
+        let options = LoadOptions { reference: reference.map(Path::to_owned), ..loading };
         let of_dataset = Dataset::photographs(input, &options)?;
         let borders = Arc::new(Borders::of_photographs(&of_dataset, &options));
         let of_view = |Photograph { name, split, input, reference, mask }| InputPhotograph {
@@ -113,7 +111,7 @@ pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<Input
         if let Some(line) = unread_in(input) {
             tracing::warn!("{line}");
         }
-        let plain = |file: &PathBuf| plain(file, args.reference.as_deref());
+        let plain = |file: &PathBuf| plain(file, reference);
         let mut all: Vec<InputPhotograph> = files.iter().map(plain).collect::<Result<_>>()?;
         if let Some(line) =
             MaskFile::find_labels(all.iter_mut().filter_map(|one| one.mask.as_mut()))
@@ -136,8 +134,8 @@ pub(super) fn listed(args: &ApplyArgs, config: &TrainConfig) -> Result<Vec<Input
         (photograph.balance, photograph.levels) = (balance, levels);
         photograph.is_reduced = is_reduced;
     }
-    if let Some(out) = &args.out {
-        set_targets(&mut photographs, out, args.format)?;
+    if let Some(out) = out {
+        set_targets(&mut photographs, out)?;
     }
     Ok(photographs)
 }
@@ -180,12 +178,7 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<InputPhotograph> {
 }
 
 /// Sets the file that each is written to, refusing duplicates and photographs.
-fn set_targets(
-    photographs: &mut [InputPhotograph],
-    out: &Path,
-    format: OutputFormat,
-) -> Result<()> {
-    let extension = format.extension();
+fn set_targets(photographs: &mut [InputPhotograph], (out, extension): (&Path, &str)) -> Result<()> {
     let mut sources: Vec<PathBuf> = vec![];
     for listed in &*photographs {
         sources

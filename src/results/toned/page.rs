@@ -1,4 +1,4 @@
-//! The page of `tone apply`: all photographs dark and lit, measurements, histograms of luminance.
+//! The page of mapped photographs: all photographs dark and lit, measurements, histograms of luminance.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use nightsplat_report::{
 };
 
 use super::photographs::InputPhotograph;
-use super::{ApplyArgs, CurveOnSet, Mapped, Measures, ToneOutput, ToneReport, without};
+use super::{CurveOnSet, Mapped, Measures, ToneOutput, ToneReport, ToneRequest, without};
 use crate::Result;
 use crate::gpu::Gpu;
 use crate::results::eval;
@@ -41,16 +41,15 @@ pub(super) struct TonePage {
 impl TonePage {
     pub(super) fn new(
         gpu: &Gpu,
-        args: &ApplyArgs,
+        request: &ToneRequest<'_>,
         photographs: &[InputPhotograph],
     ) -> Result<Self> {
-        let compared = args.compare.iter().map(|curve| {
-            let config = args.config(Some(curve))?;
-            let masks = (args.input.as_path(), config.invert_masks);
-            let set = CurveOnSet::new(gpu, config.tone, photographs, masks)?;
-            Ok((set, Distribution::new(curve.to_string())))
+        let compared = request.compared.iter().map(|(curve, config)| {
+            let masks = (request.input, config.invert_masks);
+            let set = CurveOnSet::new(gpu, config.tone.clone(), photographs, masks)?;
+            Ok((set, Distribution::new(curve.clone())))
         });
-        let curve = args.tone.name();
+        let (curve, _) = request.curve.clone();
         Ok(Self {
             only_referenced: photographs.iter().any(|listed| listed.reference.is_some()),
             input: Distribution::new("photograph"),
@@ -133,7 +132,7 @@ fn picture(caption: &str, scores: Option<Scores>, image: &Image) -> Picture {
 
 /// Measurements of the photographs in the order of their names, then of the scene; without what no photograph has, and
 /// without what the curve does not use.
-pub(super) fn table(output: &ToneOutput) -> NumberTable {
+pub(crate) fn table(output: &ToneOutput) -> NumberTable {
     let column =
         |name: &str, digits| Column { name: name.to_owned(), digits, best: Best::Unmarked };
     let measured = |Measures { mean_luminance, near_white_fraction, skewness, .. }: Measures| {
