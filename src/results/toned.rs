@@ -62,6 +62,8 @@ pub(crate) enum ToneProgress<'a> {
     Mapped(&'a Image, &'a Path),
     /// A photograph cannot be used.
     Skipped(&'a Error),
+    /// There is no further photograph.
+    Finished,
 }
 
 /// Statistics of the sRGB-encoded values of a photograph or of a result.
@@ -198,6 +200,7 @@ pub(crate) fn apply(
             Err(error) => return Err(error),
         }
     }
+    follow(ToneProgress::Finished)?;
     set.colours.iter().for_each(ColourCounts::log);
     let exposure = set.targets.scene.exposure;
     let Some(mut scene) = scene(&views) else {

@@ -144,11 +144,11 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
             ToneProgress::Skipped(error) => {
                 bar.suspend(|| tracing::warn!("skipped: {error}"));
             }
+            // What follows may warn.
+            ToneProgress::Finished => bar.finish_and_clear(),
         }
         Ok(())
     };
     let open = || driver::open(&args.device.clone().unwrap_or_default());
-    let output = toned::apply(&request, &open, &follow);
-    bar.finish_and_clear();
-    output
+    toned::apply(&request, &open, &follow)
 }

@@ -288,21 +288,23 @@ impl LampObservations {
             sums.iter().zip(&total).map(mean).collect()
         };
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        let mut left = self.sums_of_views(column, weights);
+        let left = self.sums_of_views(column, weights);
         let mut means = scaled(&left);
         let (mut direction, mut square) = (means.clone(), dot(&left, &means));
         for _ in 0..ROUNDS {
+            if means.iter().all(|mean| mean.abs() < PRECISION) {
+                break;
+            }
             let mut along: Vec<f64> = self.view.iter().map(|&view| direction[view]).collect();
             self.less_points(&mut along, weights);
             let curvature = dot(&direction, &self.sums_of_views(&along, weights));
-            let is_done = means.iter().all(|mean| mean.abs() < PRECISION);
-            if is_done || curvature <= f64::MIN_POSITIVE {
+            if curvature <= f64::MIN_POSITIVE {
                 break;
             }
             let step = square / curvature;
             column.iter_mut().zip(&along).for_each(|(one, along)| *one -= step * along);
             of_views.iter_mut().zip(&direction).for_each(|(all, along)| *all += step * along);
-            left = self.sums_of_views(column, weights);
+            let left = self.sums_of_views(column, weights);
             means = scaled(&left);
             let before = std::mem::replace(&mut square, dot(&left, &means));
             let kept = square / before;
