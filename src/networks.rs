@@ -11,9 +11,9 @@ pub mod crop;
 mod denoiser;
 mod file;
 mod half;
-mod inner;
 pub mod lpips;
 mod norm;
+mod norm_half;
 mod parameters;
 mod relu;
 mod reserved;
@@ -67,6 +67,16 @@ pub(crate) fn conv_shape(gpu: &Gpu) -> [u32; 2] {
         device if device.subgroup_size <= NARROW_SUBGROUP => NARROW_GPU_SHAPE,
         _ => GPU_SHAPE,
     }
+}
+
+/// The threads of a workgroup that every device has.
+const WORKGROUP_THREADS: u32 = 256;
+
+/// The subgroups of a workgroup that share what they read, at most `count`: on a GPU in the cache, which those of other
+/// workgroups would miss.
+fn side_by_side(gpu: &Gpu, count: u32) -> u32 {
+    let device = gpu.properties();
+    if device.is_cpu { 1 } else { count.min(WORKGROUP_THREADS / device.subgroup_size).clamp(1, 8) }
 }
 
 /// The number of pixels of a view.

@@ -53,11 +53,15 @@ mod max_pool;
 mod motion_vectors;
 pub mod norm;
 mod norm_backward;
+mod norm_backward_half;
 mod norm_backward_merge;
 mod norm_backward_sums;
+mod norm_backward_sums_half;
 mod norm_forward;
+mod norm_forward_half;
 mod norm_merge;
 mod norm_statistics;
+mod norm_statistics_half;
 pub mod normals;
 mod normals_backward;
 mod order_counts;
@@ -95,6 +99,7 @@ mod ssim_backward;
 mod ssim_forward;
 mod structure_l1;
 mod tile_begins;
+mod unpack_map;
 
 use glam::UVec2;
 

@@ -11,11 +11,7 @@ layout(push_constant) uniform Params {
     uint slot;         // use of the layer times `channel_count`: the index of its statistics
 };
 
-// Mean and 1 / standard deviation of a channel.
-struct ChannelStatistics {
-    float mean;
-    float inverse_deviation;
-};
+#include "channel_statistics.glsl"
 
 // Workgroups: (chunks, channels); (1, channels) if chunks are merged.
 #define CHANNEL gl_WorkGroupID.y

@@ -9,10 +9,10 @@
 //! TRANSPOSED: weight[i, o, -t] and no bias, which turns dL/d output into dL/d input; `in_channels` is the number of
 //! channels read. A lane owns COLUMNS x ROWS pixels of OUT_BLOCK output channels in registers: an implicit matrix
 //! product whose inner dimension is (i, t). The lanes of a subgroup are side by side; they load the weights of an input
-//! channel together and broadcast them, so no shared memory and no barrier is needed. Reference:
-//! `src/reference/conv3x3.rs`.
+//! channel together and broadcast them, so no shared memory and no barrier is needed. The SUBGROUPS of a workgroup have
+//! the next output channels, and find the pixels in the cache. Reference: `src/reference/conv3x3.rs`.
 
-layout(local_size_x_id = 100) in;
+layout(local_size_x_id = 100, local_size_y_id = 6) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(constant_id = 0) const uint COLUMNS = 1;
 layout(constant_id = 1) const uint ROWS = 8;
@@ -20,6 +20,7 @@ layout(constant_id = 2) const uint OUT_BLOCK = 8;
 layout(constant_id = 3) const uint ACTIVATION = 0;      // one of those below
 layout(constant_id = 4) const bool TRANSPOSED = false;
 layout(constant_id = 5) const bool ACCUMULATE = false;  // add to the output
+layout(constant_id = 6) const uint SUBGROUPS = 1;
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;          // pixels
@@ -28,7 +29,7 @@ layout(push_constant, scalar) uniform Params {
     uint offset;  // of the layer in `values`: weights (out, in, 3, 3), or (in, out, 3, 3) if TRANSPOSED, then biases
 };
 
-// Workgroups: (out blocks, columns / (SUBGROUP_SIZE COLUMNS), rows / ROWS), so that neighbours read the same pixels.
+// Workgroups: (out blocks / SUBGROUPS, columns / (SUBGROUP_SIZE COLUMNS), rows / ROWS); neighbours share pixels.
 layout(binding = 0) readonly buffer Values { float values[]; };
 layout(binding = 1) readonly buffer Source { float source[]; };  // (in, H, W)
 layout(binding = 2)          buffer Target { float target[]; };  // (out, H, W)
@@ -47,7 +48,8 @@ float activate(float x) {
 
 void main() {
     uint lane = gl_SubgroupInvocationID;
-    uint first_channel = gl_WorkGroupID.x * OUT_BLOCK;
+    uint first_channel = (gl_WorkGroupID.x * SUBGROUPS + gl_SubgroupID) * OUT_BLOCK;
+    if (first_channel >= out_channels) return;
     ivec2 origin = ivec2((gl_WorkGroupID.y * SUBGROUP_SIZE + lane) * COLUMNS, gl_WorkGroupID.z * ROWS);
     ivec2 last = ivec2(size) - 1;
     uint plane = size.x * size.y;

@@ -6,13 +6,15 @@
 //!
 //! d weight[o, i, t] = sum over p of d_output[o](p) input[i](p + t), d bias[o] = sum over p of d_output[o](p). A
 //! subgroup processes one input channel, OUT_BLOCK output channels and one strip, its lanes side by side, and slides a
-//! window of three rows down the strip: an input value is loaded three times per strip instead of nine. `reduce_strips`
-//! sums the sets. Reference: `src/reference/conv3x3_weight_gradient.rs`.
+//! window of three rows down the strip: an input value is loaded three times per strip instead of nine. The SUBGROUPS
+//! of a workgroup have the next input channels, and find the gradient in the cache. `reduce_strips` sums the sets.
+//! Reference: `src/reference/conv3x3_weight_gradient.rs`.
 
-layout(local_size_x_id = 100) in;
+layout(local_size_x_id = 100, local_size_y_id = 2) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(constant_id = 0) const uint ROWS = 16;
 layout(constant_id = 1) const uint OUT_BLOCK = 8;
+layout(constant_id = 2) const uint SUBGROUPS = 1;
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;  // pixels
@@ -20,7 +22,7 @@ layout(push_constant, scalar) uniform Params {
     uint  out_channels;
 };
 
-// Workgroups: (in channels, out blocks, strips).
+// Workgroups: (in channels / SUBGROUPS, out blocks, strips).
 layout(binding = 0) readonly  buffer Source   { float source[]; };    // (in, H, W)
 layout(binding = 1) readonly  buffer DTarget  { float d_target[]; };  // (out, H, W)
 layout(binding = 2) writeonly buffer Partials { float partials[]; };  // (strips, out in 9 + out): weights, then biases
@@ -34,7 +36,8 @@ float padded(uint plane, ivec2 at) {
 }
 
 void main() {
-    uint channel = gl_WorkGroupID.x;
+    uint channel = gl_WorkGroupID.x * SUBGROUPS + gl_SubgroupID;
+    if (channel >= in_channels) return;
     uint first_channel = gl_WorkGroupID.y * OUT_BLOCK;
     uint strip = gl_WorkGroupID.z;
     uint top = strip * ROWS;

@@ -12,22 +12,23 @@
 #include "kernel.glsl"
 #include "packed.glsl"
 
-//! The partial sums of `conv3x3_weight_gradient` as products of cooperative matrices: factors of 16 bits, sums in
-//! single precision.
+//! The partial sums of `conv3x3_weight_gradient` for the weights, as products of cooperative matrices: factors of 16
+//! bits, sums in single precision.
 //!
 //! d_weight(M out, N in) of tap t += d_target(M out, K pixels) input_t(K pixels, N in) for every K pixels of every row
-//! of a strip, both from `pack_map`. A subgroup owns a matrix of output channels by one of input channels, for all nine
+//! of a strip, both packed. A subgroup owns a matrix of output channels by one of input channels, for all nine
 //! taps, and slides a window of three rows down K columns after K columns: a matrix of input is loaded once. Two
-//! matrices of output channels would spill (compiled by Mesa 25 for Navi 31).
-//! `pack_map` states the rounding error. Biases are summed in single precision. Reference:
-//! `src/reference/conv3x3_weight_gradient_half.rs`.
+//! matrices of output channels would spill (compiled by Mesa 25 for Navi 31). The SUBGROUPS of a workgroup have the
+//! next input channels, and find the gradient of the output in the cache. `pack_map` states the rounding error.
+//! Reference: `src/reference/conv3x3_weight_gradient_half.rs`.
 
-layout(local_size_x_id = 100) in;
+layout(local_size_x_id = 100, local_size_y_id = 4) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(constant_id = 0) const uint M = 8;       // output channels of a matrix
 layout(constant_id = 1) const uint N = 8;       // input channels of a matrix
 layout(constant_id = 2) const uint K = 8;       // pixels of a matrix, side by side
 layout(constant_id = 3) const uint ROWS = 4;    // of a strip
+layout(constant_id = 4) const uint SUBGROUPS = 1;
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;  // pixels
@@ -35,13 +36,12 @@ layout(push_constant, scalar) uniform Params {
     uint  out_channels;
 };
 
-// Workgroups: (in channels / N, out channels / M, strips).
-layout(binding = 0) readonly  buffer LargestSource  { uint largest_source[]; };     // as for `pack_map`
-layout(binding = 1) readonly  buffer LargestDTarget { uint largest_d_target[]; };
-layout(binding = 2) readonly  buffer Source         { HALVES source[]; };           // (rows, columns, in)
-layout(binding = 3) readonly  buffer DTarget        { HALVES d_target[]; };         // (rows, columns, out)
-layout(binding = 4) readonly  buffer DTargetSingle  { float d_target_single[]; };   // (out, H, W)
-layout(binding = 5) writeonly buffer Partials { float partials[]; };  // (strips, out in 9 + out): weights, then biases
+// Workgroups: (packed in channels / (N SUBGROUPS), out channels / M, strips).
+layout(binding = 0) readonly  buffer SourceBound  { uint source_bound[]; };
+layout(binding = 1) readonly  buffer DTargetBound { uint d_target_bound[]; };
+layout(binding = 2) readonly  buffer Source   { HALVES source[]; };    // (rows, columns, in)
+layout(binding = 3) readonly  buffer DTarget  { HALVES d_target[]; };  // (rows, columns, out)
+layout(binding = 4) writeonly buffer Partials { float partials[]; };   // (strips, out, in, 9)
 
 #ifdef REFLECTION
 void main() {}
@@ -49,12 +49,15 @@ void main() {}
 
 const uint TAPS = 9;
 
-shared float sums[M * N];
+shared float sums[SUBGROUPS * M * N];
 
 void main() {
     uint from = packed_channels(in_channels), to = packed_channels(out_channels);
     uint columns = packed_size(size).x;
-    uint first_in = gl_WorkGroupID.x * N;
+    // Subgroups beyond the last channels repeat sums, which are discarded.
+    uint first_in = (gl_WorkGroupID.x * SUBGROUPS + gl_SubgroupID) * N;
+    bool is_channel = first_in < from;
+    first_in = min(first_in, from - N);
     uint first_out = gl_WorkGroupID.y * M;
     uint top = gl_WorkGroupID.z * ROWS;
     uint end = min(top + ROWS, size.y);
@@ -86,30 +89,20 @@ void main() {
         }
     }
 
-    uint weight_count = TAPS * in_channels * out_channels;
-    uint set = gl_WorkGroupID.z * (weight_count + out_channels);
+    uint set = gl_WorkGroupID.z * TAPS * in_channels * out_channels;
+    uint first_sum = gl_SubgroupID * M * N;
     [[unroll]] for (uint t = 0; t < TAPS; ++t) {
         barrier();
-        coopMatStore(sum[t], sums, 0, N, gl_CooperativeMatrixLayoutRowMajor);
+        coopMatStore(sum[t], sums, first_sum, N, gl_CooperativeMatrixLayoutRowMajor);
         barrier();
         // Unrolled: around a loop that stays one, the index of a matrix is no constant and moves all to memory.
         [[unroll]] for (uint k = 0; k < M * N; k += SUBGROUP_SIZE) {
             uint i = k + gl_SubgroupInvocationID;
             uint channel = first_out + i / N, other = first_in + i % N;
-            if (i < M * N && channel < out_channels && other < in_channels)
-                partials[set + (channel * in_channels + other) * TAPS + t] = unpacked(sums[i], largest_d_target[0],
-                    largest_source[0]);
+            if (i < M * N && is_channel && channel < out_channels && other < in_channels)
+                partials[set + (channel * in_channels + other) * TAPS + t] = unpacked(sums[first_sum + i],
+                    d_target_bound[0], source_bound[0]);
         }
-    }
-
-    if (first_in > 0) return;
-    for (uint channel = first_out; channel < min(first_out + M, out_channels); ++channel) {
-        float bias = 0.0;
-        uint begin = (channel * size.y + top) * size.x;
-        for (uint i = gl_SubgroupInvocationID; i < (end - top) * size.x; i += SUBGROUP_SIZE)
-            bias += d_target_single[begin + i];
-        bias = subgroupAdd(bias);
-        if (gl_SubgroupInvocationID == 0) partials[set + weight_count + channel] = bias;
     }
 }
 #endif

@@ -7,8 +7,8 @@
 //! beyond.
 //!
 //! A thread writes PACKED_CHANNELS channels of a packed pixel; neighbouring threads read neighbouring pixels. The
-//! rounding error is at most 2^-10, and values below 2^-28 of the map's largest magnitude may become 0, since their
-//! halves are subnormal, which some devices flush; below 2^-39 they do. Reference: `src/reference/pack_map.rs`.
+//! rounding error is at most 2^-10, and values below 2^-28 of the map's bound may become 0, since their halves are
+//! subnormal, which some devices flush; below 2^-39 they do. Reference: `src/reference/pack_map.rs`.
 
 layout(local_size_x = 256) in;
 
@@ -17,7 +17,7 @@ layout(push_constant, scalar) uniform Params {
     uint  channels;
 };
 
-layout(binding = 0) readonly  buffer Largest { uint largest[]; };   // of the map's magnitudes, one
+layout(binding = 0) readonly  buffer Bound   { uint bound[]; };     // of the map
 layout(binding = 1) readonly  buffer Source  { float source[]; };   // (C, H, W)
 layout(binding = 2) writeonly buffer Packed  { uvec4 packed[]; };   // (rows, columns, channels), eight halves each
 
@@ -30,18 +30,14 @@ void main() {
     uvec2 at = uvec2(pixel % extent.x, pixel / extent.x) - 1;
     bool is_inside = at.x < size.x && at.y < size.y;
     uint plane = size.x * size.y, from = is_inside ? at.y * size.x + at.x : 0;
-    float scale = packed_scale(packed_exponent(largest[0]));
+    float scale = packed_scale(packed_exponent(bound[0]));
     uint first = block * PACKED_CHANNELS;
     [[unroll]] for (uint eight = 0; eight < PACKED_CHANNELS / 8; ++eight) {
-        uvec4 words;
-        [[unroll]] for (uint w = 0; w < 4; ++w) {
-            vec2 pair = vec2(0.0);
-            [[unroll]] for (uint half_of = 0; half_of < 2; ++half_of) {
-                uint channel = first + 8 * eight + 2 * w + half_of;
-                if (is_inside && channel < channels) pair[half_of] = scale * source[channel * plane + from];
-            }
-            words[w] = packHalf2x16(pair);
+        float values[8];
+        [[unroll]] for (uint c = 0; c < 8; ++c) {
+            uint channel = first + 8 * eight + c;
+            values[c] = is_inside && channel < channels ? source[channel * plane + from] : 0.0;
         }
-        packed[(pixel * blocks + block) * (PACKED_CHANNELS / 8) + eight] = words;
+        packed[(pixel * blocks + block) * (PACKED_CHANNELS / 8) + eight] = packed_eight(values, scale);
     }
 }

@@ -18,7 +18,7 @@ layout(push_constant) uniform Params {
     uint offset;        // of the layer in `values`: weights (out, in, 3, 3)
 };
 
-layout(binding = 0) readonly  buffer Largest { uint largest[]; };   // of the weights' magnitudes, one
+layout(binding = 0) readonly  buffer Bound   { uint bound[]; };   // of the weights
 layout(binding = 1) readonly  buffer Values  { float values[]; };
 layout(binding = 2) writeonly buffer Packed  { uvec4 packed[]; };   // (tap, to, from), eight halves each
 
@@ -43,7 +43,7 @@ void main() {
     uint i = THREAD_INDEX, eights = from_count / 8;
     if (i >= TAPS * to_count * eights) return;
     uint first = 8 * (i % eights), to = i / eights % to_count, tap = i / (eights * to_count);
-    float scale = packed_scale(packed_exponent(largest[0]));
+    float scale = packed_scale(packed_exponent(bound[0]));
     uvec4 words;
     [[unroll]] for (uint w = 0; w < 4; ++w)
         words[w] = packHalf2x16(scale * vec2(weight(tap, to, first + 2 * w), weight(tap, to, first + 2 * w + 1)));

@@ -3,7 +3,7 @@
 use glam::UVec2;
 use serde::{Deserialize, Serialize};
 
-use super::conv_shape;
+use super::{conv_shape, side_by_side};
 use crate::gpu::{Buffer, CooperativeMatrix, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{conv3x3, conv3x3_weight_gradient, reduce_strips};
 use crate::{Error, Result};
@@ -78,6 +78,8 @@ pub(super) struct Conv {
     forward: Product,
     data_gradient: Product,
     weight_gradient: Pipeline<conv3x3_weight_gradient::Kernel>,
+    /// Subgroups of a workgroup of the weight gradient.
+    subgroups: u32,
     reduce: Reduce,
 }
 
@@ -112,6 +114,7 @@ impl Conv {
         let forward = ConvVariant { activation, transposed: false, accumulate };
         let accumulate = adds == AccumulateInto::InputGradient;
         let backward = ConvVariant { activation: none, transposed: true, accumulate };
+        let subgroups = side_by_side(gpu, inputs);
         Ok(Self {
             inputs,
             outputs,
@@ -120,7 +123,9 @@ impl Conv {
             weight_gradient: gpu.pipeline(&conv3x3_weight_gradient::Constants {
                 rows: STRIP_ROWS,
                 out_block: outputs.min(OUT_BLOCK),
+                subgroups,
             })?,
+            subgroups,
             reduce: Reduce::new(gpu)?,
         })
     }
@@ -157,9 +162,14 @@ impl Conv {
                 d_target: d_target.slice(),
                 partials: strips.partials.slice_mut(),
             },
-            Threads::Workgroups([inputs, outputs.div_ceil(outputs.min(OUT_BLOCK)), strip_count]),
+            Threads::Workgroups([
+                inputs.div_ceil(self.subgroups),
+                outputs.div_ceil(outputs.min(OUT_BLOCK)),
+                strip_count,
+            ]),
         )?;
-        self.reduce.record(pass, [inputs, outputs], strip_count, layer.offset, strips)?;
+        let parameter_count = layer_len(inputs, outputs);
+        self.reduce.record(pass, parameter_count, strip_count, layer.offset, strips)?;
         self.data_gradient.record(pass, size, [outputs, inputs], layer, d_target, d_source)
     }
 }
@@ -172,7 +182,7 @@ pub(super) struct ConvVariant {
     pub(super) accumulate: bool,
 }
 
-/// The convolution kernel, and the pixels and channels per subgroup.
+/// The convolution kernel, the pixels of a workgroup, and its channels.
 #[derive(Debug)]
 pub(super) struct Product {
     kernel: Pipeline<conv3x3::Kernel>,
@@ -185,17 +195,19 @@ impl Product {
     pub(super) fn new(gpu: &Gpu, outputs: u32, variant: ConvVariant) -> Result<Self> {
         let ConvVariant { activation, transposed, accumulate } = variant;
         let [columns, rows] = conv_shape(gpu);
-        let channels = outputs.min(OUT_BLOCK);
+        let out_block = outputs.min(OUT_BLOCK);
+        let subgroups = side_by_side(gpu, outputs.div_ceil(out_block));
         let kernel = gpu.pipeline(&conv3x3::Constants {
             columns,
             rows,
-            out_block: channels,
+            out_block,
             activation: activation as u32,
             transposed,
             accumulate,
+            subgroups,
         })?;
         let columns = columns * gpu.properties().subgroup_size;
-        Ok(Self { kernel, columns, rows, channels })
+        Ok(Self { kernel, columns, rows, channels: out_block * subgroups })
     }
 
     pub(super) fn record(
@@ -244,12 +256,11 @@ impl Reduce {
     pub(super) fn record(
         &self,
         pass: &mut Recorder<'_>,
-        [inputs, outputs]: [u32; 2],
+        parameter_count: u32,
         strip_count: u32,
         offset: u32,
         Strips { partials, gradients }: &mut Strips<'_>,
     ) -> Result<()> {
-        let parameter_count = layer_len(inputs, outputs);
         pass.dispatch(
             &self.0,
             &reduce_strips::Params { parameter_count, strip_count, offset },

@@ -12,6 +12,7 @@
 //! Activations are kept for one stage at a time, or for every stage if [`Denoiser::keep_activations`] finds memory;
 //! otherwise the backward pass recomputes those of the earlier stages from their inputs `R_k`, to the same bits.
 
+mod inner;
 mod memory;
 
 use glam::UVec2;
@@ -19,11 +20,10 @@ use nightsplat_core::random::Stream;
 use nightsplat_core::settings;
 use nightsplat_core::settings::Rule;
 
-use self::memory::{Activations, DenoiserMemory, EarlierStages, Repeat};
+use self::inner::{Inner, InnerStage};
+use self::memory::{Activations, DenoiserMemory, EarlierStages, StageGradients};
 use super::conv::{AccumulateInto, Activation, Backward, Conv, Layer, Precision, Strips};
-use super::half::{Direction, PackedMap};
-use super::inner::{Inner, InnerLayer, PackedBackward};
-use super::norm::{Forward, Norm, NormUse};
+use super::half::Direction;
 use super::parameters::{ParameterLayout, Parameters};
 use super::relu::ReluBackward;
 use super::reserved::Reserved;
@@ -109,11 +109,9 @@ struct DenoiserStage {
 #[derive(Debug)]
 struct DenoiserKernels {
     channels: u32,
-    repeats: usize,
     conv_in: Conv,
-    conv: Inner,
+    inner: Inner,
     conv_out: Conv,
-    norm: Norm,
     relu_backward: ReluBackward,
     residual: Pipeline<residual::Kernel>,
     residual_backward: Pipeline<residual_backward::Kernel>,
@@ -250,7 +248,7 @@ impl Denoiser {
             let (before, from_here) = denoised.split_at_mut(k);
             let stage_input = before.last().unwrap_or(input);
             let activations = earlier.activations(k, extent, shared);
-            kernels.conv.prepare(pass, Direction::Forward, stage.inner(&parameters.values))?;
+            kernels.inner.prepare(pass, Direction::Forward, stage.inner(&parameters.values))?;
             let values = &parameters.values;
             kernels.stage_forward(pass, size, stage, values, stage_input, activations)?;
             pass.dispatch(
@@ -290,7 +288,7 @@ impl Denoiser {
         let are_kept = extent.fits(earlier.extent());
         pass.fill(&mut parameters.gradients, 0);
         for stage in stages.iter() {
-            kernels.conv.prepare(pass, Direction::Backward, stage.inner(&parameters.values))?;
+            kernels.inner.prepare(pass, Direction::Backward, stage.inner(&parameters.values))?;
         }
         let last = stages.len() - 1;
         for (k, stage) in stages.iter().enumerate().rev() {
@@ -321,9 +319,7 @@ impl Denoiser {
             )?;
             let maps = Maps {
                 activations,
-                d_features: &mut memory.d_features,
-                d_convolved: &mut memory.d_convolved,
-                d_packed: &mut memory.d_packed,
+                gradients: &mut memory.gradients,
                 partials: &mut memory.partials,
             };
             let ends = StageMaps { stage_input, d_update: &memory.d_update, d_stage_input };
@@ -336,9 +332,7 @@ impl Denoiser {
 /// The images that the backward pass of a stage reads and overwrites.
 struct Maps<'a> {
     activations: &'a mut Activations,
-    d_features: &'a mut Buffer<f32>,
-    d_convolved: &'a mut Buffer<f32>,
-    d_packed: &'a mut PackedMap,
+    gradients: &'a mut StageGradients,
     partials: &'a mut Buffer<f32>,
 }
 
@@ -362,11 +356,9 @@ impl DenoiserKernels {
         let activation = if identity { Activation::None } else { Activation::Sigmoid };
         Ok(Self {
             channels,
-            repeats: settings.repeats as usize,
             conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, adds)?,
-            conv: Inner::new(gpu, channels, settings.stages, adds, precision)?,
+            inner: Inner::new(gpu, channels, settings.stages, precision)?,
             conv_out: Conv::new(gpu, [channels, RGB], activation, AccumulateInto::Nothing)?,
-            norm: Norm::new(gpu, channels)?,
             relu_backward: ReluBackward::new(gpu)?,
             residual: gpu.pipeline(&residual::Constants { identity })?,
             residual_backward: gpu.pipeline(&residual_backward::Constants { identity })?,
@@ -383,15 +375,11 @@ impl DenoiserKernels {
         input: &Buffer<f32>,
         activations: &mut Activations,
     ) -> Result<()> {
-        let first = activations.first_features();
+        let first = &mut activations.features[0];
         self.conv_in.forward(pass, size, Layer { offset: stage.conv_in, values }, input, first)?;
-        for repeat in 0..self.repeats {
-            let Repeat { shortcut, packed, convolved, norm, target } = activations.repeat(repeat);
-            self.conv.forward(pass, size, stage.inner(values), shortcut, packed, convolved)?;
-            let images = Forward { source: convolved, shortcut, target };
-            self.norm.forward(pass, stage.norm_use(size, repeat), values, norm, images)?;
-        }
-        let (last, update) = activations.ends(self.repeats);
+        self.inner.forward(pass, size, stage.inner(values), activations)?;
+        let Activations { features, update, .. } = activations;
+        let last = &features[features.len() - 1];
         self.conv_out.forward(pass, size, Layer { offset: stage.conv_out, values }, last, update)
     }
 
@@ -406,31 +394,21 @@ impl DenoiserKernels {
         ends: StageMaps<'_>,
     ) -> Result<()> {
         let Parameters { values, gradients, .. } = parameters;
-        let Maps { activations, d_features, d_convolved, d_packed, partials } = maps;
+        let Maps { activations, gradients: of_maps, partials } = maps;
         let mut strips = Strips { partials, gradients };
+        let features = &activations.features;
         let images = Backward {
-            source: activations.features(self.repeats),
+            source: &features[features.len() - 1],
             d_target: ends.d_update,
-            d_source: &mut *d_features,
+            d_source: &mut of_maps.features,
         };
         let layer = Layer { offset: stage.conv_out, values };
         self.conv_out.backward(pass, size, layer, images, &mut strips)?;
-        for repeat in (0..self.repeats).rev() {
-            let Activations { convolved, norm, .. } = &mut *activations;
-            let (d_target, d_source) = (&*d_features, &mut *d_convolved);
-            let images = Backward { source: &convolved[repeat], d_target, d_source };
-            let norm_use = stage.norm_use(size, repeat);
-            self.norm.backward(pass, norm_use, values, strips.gradients, norm, images)?;
-            // The shortcut passes the gradient through: that of the convolution is added to it.
-            let (source, d_source) = (activations.features(repeat), &mut *d_features);
-            let images = Backward { source, d_target: &*d_convolved, d_source };
-            let source = &activations.packed[repeat];
-            let packed = PackedBackward { source, d_target: &mut *d_packed };
-            self.conv.backward(pass, size, stage.inner(values), images, packed, &mut strips)?;
-        }
+        let inner = stage.inner(values);
+        self.inner.backward(pass, size, inner, activations, of_maps, &mut strips)?;
         let value_count = self.channels * size.element_product();
-        let first = activations.features(0);
-        self.relu_backward.record(pass, value_count, first, d_features)?;
+        let d_features = &mut of_maps.features;
+        self.relu_backward.record(pass, value_count, &activations.features[0], d_features)?;
         let StageMaps { stage_input: source, d_stage_input: d_source, .. } = ends;
         let images = Backward { source, d_target: &*d_features, d_source };
         let layer = Layer { offset: stage.conv_in, values };
@@ -439,12 +417,8 @@ impl DenoiserKernels {
 }
 
 impl DenoiserStage {
-    /// The repeated layer.
-    fn inner(self, values: &Buffer<f32>) -> InnerLayer<'_> {
-        InnerLayer { number: self.number, layer: Layer { offset: self.conv, values } }
-    }
-
-    fn norm_use(&self, size: UVec2, repeat: usize) -> NormUse {
-        NormUse { pixel_count: size.element_product(), offset: self.norm, repeat: repeat as u32 }
+    /// The repeated layers.
+    fn inner(self, values: &Buffer<f32>) -> InnerStage<'_> {
+        InnerStage { number: self.number, conv: self.conv, norm: self.norm, values }
     }
 }

@@ -1,7 +1,7 @@
 //! Norm, `ReLU` and shortcut of a repeat: f' = f + relu(gamma (z - mean) / deviation + beta), with the statistics of
 //! the image.
 
-use glam::Vec2;
+use glam::{UVec2, Vec2};
 
 use super::conv::Backward;
 use crate::Result;
@@ -12,35 +12,44 @@ use crate::kernels::{
 };
 
 /// Values of a channel per subgroup.
-const CHUNK: u32 = 1024;
+pub(super) const CHUNK: u32 = 1024;
 
 /// The kernels of a norm that is used several times.
 #[derive(Debug)]
 pub(super) struct Norm {
     channels: u32,
     statistics: Pipeline<norm_statistics::Kernel>,
-    merge: Pipeline<norm_merge::Kernel>,
     forward: Pipeline<norm_forward::Kernel>,
     backward_sums: Pipeline<norm_backward_sums::Kernel>,
-    backward_merge: Pipeline<norm_backward_merge::Kernel>,
     backward: Pipeline<norm_backward::Kernel>,
+    merge: NormMerge,
+}
+
+/// The kernels that merge the chunks of a channel.
+#[derive(Debug)]
+pub(super) struct NormMerge {
+    channels: u32,
+    statistics: Pipeline<norm_merge::Kernel>,
+    sums: Pipeline<norm_backward_merge::Kernel>,
 }
 
 /// State between forward and backward, and scratch memory.
 #[derive(Debug)]
 pub(super) struct NormMemory {
     /// (uses, C)
-    statistics: Buffer<ChannelStatistics>,
+    pub(super) statistics: Buffer<ChannelStatistics>,
     /// (C, chunks)
-    partials: Buffer<Vec2>,
+    pub(super) partials: Buffer<Vec2>,
     /// (C,)
-    sums: Buffer<Vec2>,
+    pub(super) sums: Buffer<Vec2>,
+    /// The largest magnitude of a packed gradient, as bits.
+    pub(super) largest: Buffer<u32>,
 }
 
-/// One use of a norm: pixels, offset of its parameters, and index of the use.
+/// One use of a norm: the size of its maps, offset of its parameters, and index of the use.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct NormUse {
-    pub(super) pixel_count: u32,
+    pub(super) size: UVec2,
     pub(super) offset: u32,
     pub(super) repeat: u32,
 }
@@ -56,11 +65,11 @@ pub(super) struct Forward<'a> {
     pub(super) target: &'a mut Buffer<f32>,
 }
 
-/// The push constants of all six kernels.
-macro_rules! params {
+/// The push constants of all kernels.
+macro_rules! norm_params {
     ($norm:ident, $of:ident, $kernel:ident) => {
         $kernel::Params {
-            pixel_count: $of.pixel_count,
+            pixel_count: $of.size.element_product(),
             channel_count: $norm.channels,
             offset: $of.offset,
             slot: $of.repeat * $norm.channels,
@@ -74,11 +83,10 @@ impl Norm {
         Ok(Self {
             channels,
             statistics: gpu.pipeline(&norm_statistics::Constants { chunk })?,
-            merge: gpu.pipeline(&norm_merge::Constants { chunk })?,
             forward: gpu.pipeline(&norm_forward::Constants { chunk })?,
             backward_sums: gpu.pipeline(&norm_backward_sums::Constants { chunk })?,
-            backward_merge: gpu.pipeline(&norm_backward_merge::Constants { chunk })?,
             backward: gpu.pipeline(&norm_backward::Constants { chunk })?,
+            merge: NormMerge::new(gpu, channels, chunk)?,
         })
     }
 
@@ -91,26 +99,20 @@ impl Norm {
         memory: &mut NormMemory,
         Forward { source, shortcut, target }: Forward<'_>,
     ) -> Result<()> {
-        let NormMemory { statistics, partials, .. } = memory;
-        let (per_chunk, per_channel) = self.threads(of);
+        let (NormMemory { partials, .. }, per_chunk) = (&mut *memory, self.threads(of));
         pass.dispatch(
             &self.statistics,
-            &params!(self, of, norm_statistics),
+            &norm_params!(self, of, norm_statistics),
             norm_statistics::Buffers { source: source.slice(), partials: partials.slice_mut() },
             per_chunk,
         )?;
-        pass.dispatch(
-            &self.merge,
-            &params!(self, of, norm_merge),
-            norm_merge::Buffers { partials: partials.slice(), statistics: statistics.slice_mut() },
-            per_channel,
-        )?;
+        self.merge.statistics(pass, of, memory)?;
         pass.dispatch(
             &self.forward,
-            &params!(self, of, norm_forward),
+            &norm_params!(self, of, norm_forward),
             norm_forward::Buffers {
                 values: values.slice(),
-                statistics: statistics.slice(),
+                statistics: memory.statistics.slice(),
                 source: source.slice(),
                 shortcut: shortcut.slice(),
                 target: target.slice_mut(),
@@ -129,37 +131,27 @@ impl Norm {
         memory: &mut NormMemory,
         Backward { source, d_target, d_source }: Backward<'_>,
     ) -> Result<()> {
-        let NormMemory { statistics, partials, sums } = memory;
-        let (per_chunk, per_channel) = self.threads(of);
+        let per_chunk = self.threads(of);
         pass.dispatch(
             &self.backward_sums,
-            &params!(self, of, norm_backward_sums),
+            &norm_params!(self, of, norm_backward_sums),
             norm_backward_sums::Buffers {
                 values: values.slice(),
-                statistics: statistics.slice(),
+                statistics: memory.statistics.slice(),
                 source: source.slice(),
                 d_target: d_target.slice(),
-                partials: partials.slice_mut(),
+                partials: memory.partials.slice_mut(),
             },
             per_chunk,
         )?;
-        pass.dispatch(
-            &self.backward_merge,
-            &params!(self, of, norm_backward_merge),
-            norm_backward_merge::Buffers {
-                partials: partials.slice(),
-                sums: sums.slice_mut(),
-                gradients: gradients.slice_mut(),
-            },
-            per_channel,
-        )?;
+        self.merge.sums(pass, of, gradients, memory)?;
         pass.dispatch(
             &self.backward,
-            &params!(self, of, norm_backward),
+            &norm_params!(self, of, norm_backward),
             norm_backward::Buffers {
                 values: values.slice(),
-                statistics: statistics.slice(),
-                sums: sums.slice(),
+                statistics: memory.statistics.slice(),
+                sums: memory.sums.slice(),
                 source: source.slice(),
                 d_target: d_target.slice(),
                 d_source: d_source.slice_mut(),
@@ -168,24 +160,75 @@ impl Norm {
         )
     }
 
-    /// One workgroup per chunk and channel, and one per channel.
-    fn threads(&self, of: NormUse) -> (Threads, Threads) {
-        let per_chunk = [of.pixel_count.div_ceil(CHUNK), self.channels, 1];
-        (Threads::Workgroups(per_chunk), Threads::Workgroups([1, self.channels, 1]))
+    /// One workgroup per chunk and channel.
+    fn threads(&self, of: NormUse) -> Threads {
+        Threads::Workgroups([of.size.element_product().div_ceil(CHUNK), self.channels, 1])
+    }
+}
+
+impl NormMerge {
+    pub(super) fn new(gpu: &Gpu, channels: u32, chunk: u32) -> Result<Self> {
+        Ok(Self {
+            channels,
+            statistics: gpu.pipeline(&norm_merge::Constants { chunk })?,
+            sums: gpu.pipeline(&norm_backward_merge::Constants { chunk })?,
+        })
+    }
+
+    /// Merges the moments of chunks into the statistics of channels.
+    pub(super) fn statistics(
+        &self,
+        pass: &mut Recorder<'_>,
+        of: NormUse,
+        NormMemory { statistics, partials, .. }: &mut NormMemory,
+    ) -> Result<()> {
+        pass.dispatch(
+            &self.statistics,
+            &norm_params!(self, of, norm_merge),
+            norm_merge::Buffers { partials: partials.slice(), statistics: statistics.slice_mut() },
+            Threads::Workgroups([1, self.channels, 1]),
+        )
+    }
+
+    /// Merges the sums of chunks, and adds them to the gradients of gamma and beta.
+    pub(super) fn sums(
+        &self,
+        pass: &mut Recorder<'_>,
+        of: NormUse,
+        gradients: &mut Buffer<f32>,
+        NormMemory { partials, sums, .. }: &mut NormMemory,
+    ) -> Result<()> {
+        pass.dispatch(
+            &self.sums,
+            &norm_params!(self, of, norm_backward_merge),
+            norm_backward_merge::Buffers {
+                partials: partials.slice(),
+                sums: sums.slice_mut(),
+                gradients: gradients.slice_mut(),
+            },
+            Threads::Workgroups([1, self.channels, 1]),
+        )
     }
 }
 
 impl NormMemory {
-    pub(super) fn new(gpu: &Gpu, pixels: usize, channels: usize, uses: usize) -> Result<Self> {
+    pub(super) fn new(
+        gpu: &Gpu,
+        pixels: usize,
+        channels: usize,
+        uses: usize,
+        chunk: u32,
+    ) -> Result<Self> {
         Ok(Self {
             statistics: gpu.uninit("norm_statistics", uses * channels)?,
-            partials: gpu.uninit("norm_partials", channels * pixels.div_ceil(CHUNK as usize))?,
+            partials: gpu.uninit("norm_partials", channels * pixels.div_ceil(chunk as usize))?,
             sums: gpu.uninit("norm_sums", channels)?,
+            largest: gpu.uninit("norm_largest", 1)?,
         })
     }
 
     /// Its size in floats.
-    pub(super) fn floats(pixels: usize, channels: usize, uses: usize) -> usize {
-        2 * channels * (uses + pixels.div_ceil(CHUNK as usize) + 1)
+    pub(super) fn floats(pixels: usize, channels: usize, uses: usize, chunk: u32) -> usize {
+        2 * channels * (uses + pixels.div_ceil(chunk as usize) + 1) + 1
     }
 }

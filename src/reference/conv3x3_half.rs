@@ -1,62 +1,58 @@
-//! The convolution of `conv3x3` without activation, from packed factors, in double precision.
+//! The convolution of `conv3x3` without biases and activation, from packed factors, in double precision.
 
 use super::conv3x3::sums;
 use super::packed::{self, largest, scale, sum_error};
-use super::rounding::UNIT;
-use crate::gpu::Reference;
+use super::rounding::Rounded;
+use crate::gpu::{Reference, Tolerance};
 use crate::kernels::conv3x3;
 use crate::kernels::conv3x3_half::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// The scaled sums and the sums of the magnitudes of their terms; the largest magnitudes of the factors.
-struct Scaled {
-    sums: Vec<f64>,
-    magnitudes: Vec<f64>,
-    largest: [f64; 2],
+/// The bound of the target, with the operations of the kernel.
+fn bound(params: &Params, constants: &Constants, slices: &Slices<'_>) -> f32 {
+    let of_terms = (9 * params.in_channels) as f32 * f32::from_bits(slices.weight_bound[0]);
+    let of_sum = of_terms * f32::from_bits(slices.source_bound[0]);
+    let shortcut = f32::from_bits(slices.shortcut_largest[0]);
+    of_sum + if constants.accumulate { shortcut } else { 0.0 }
 }
 
-impl Scaled {
-    fn new(params: &Params, slices: &Slices<'_>) -> Self {
-        let Params { size, in_channels, out_channels, .. } = *params;
-        let source = packed::map(size, in_channels, slices.source);
-        let weights = packed::weights([in_channels, out_channels], slices.weights);
-        let largest = [largest(&source), largest(&weights)];
-        let layer = [weights, vec![0.0; out_channels as usize]].concat();
-        let params = conv3x3::Params { size, in_channels, out_channels, offset: 0 };
-        let of = |term: fn(f64) -> f64| sums(&params, false, &layer, &source, term);
-        Self { sums: of(|x| x), magnitudes: of(f64::abs), largest }
+/// The sums of products and what is added to, with the rounding of each operation; (C, H, W).
+fn target(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Rounded> {
+    let Params { size, in_channels, out_channels } = *params;
+    let source = packed::map(size, in_channels, slices.source);
+    let weights = packed::weights([in_channels, out_channels], slices.weights);
+    let factors = [largest(&source), largest(&weights)];
+    let layer = [weights, vec![0.0; out_channels as usize]].concat();
+    let params = conv3x3::Params { size, in_channels, out_channels, offset: 0 };
+    let of = |term: fn(f64) -> f64| sums(&params, false, &layer, &source, term);
+    let unit = scale(slices.weight_bound[0]) * scale(slices.source_bound[0]);
+    let sum = |(value, magnitude): (f64, f64)| Rounded {
+        value: value / unit,
+        error: sum_error(9 * in_channels, magnitude, factors) / unit,
+    };
+    let sums = of(|x| x).into_iter().zip(of(f64::abs)).map(sum);
+    if !constants.accumulate {
+        return sums.map(|sum| sum.rounded(2.0)).collect();
     }
-}
-
-/// The divisor of the sum of two packed factors.
-fn unit(slices: &Slices<'_>) -> f64 {
-    scale(slices.largest_weight[0]) * scale(slices.largest_source[0])
-}
-
-/// The value that is added to a sum of channel `pixel / plane`.
-fn bias(params: &Params, constants: &Constants, values: &[f32], pixel: usize) -> f64 {
-    let channel = pixel / params.size.element_product() as usize;
-    if constants.biased { values[params.biases as usize + channel].into() } else { 0.0 }
+    let shortcut = packed::unpacked(size, out_channels, slices.shortcut, slices.shortcut_bound[0]);
+    sums.zip(shortcut).map(|(sum, shortcut)| sum.rounded(2.0) + Rounded::exact(shortcut)).collect()
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let (unit, scaled) = (unit(&slices), Scaled::new(params, &slices));
-        for (pixel, sum) in scaled.sums.into_iter().enumerate() {
-            let kept = if constants.accumulate { slices.target[pixel].into() } else { 0.0 };
-            let sum = sum / unit + bias(params, constants, slices.values, pixel);
-            slices.target[pixel] = (sum + kept) as f32;
-        }
+        let bound = bound(params, constants, &slices).to_bits();
+        let values: Vec<f64> =
+            target(params, constants, &slices).into_iter().map(|it| it.value).collect();
+        slices.target_bound[0] = bound;
+        packed::write(params.size, params.out_channels, &values, bound, true, slices.target);
     }
 
-    /// The sum of products, and the rounding of each later operation.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let (unit, scaled) = (unit(&slices), Scaled::new(params, &slices));
-        let bound = |(pixel, &magnitude): (usize, &f64)| {
-            let kept = if constants.accumulate { slices.target[pixel].abs().into() } else { 0.0 };
-            let beside = bias(params, constants, slices.values, pixel).abs() + kept;
-            let of_sum = sum_error(9 * params.in_channels, magnitude, scaled.largest);
-            of_sum / unit + 4.0 * UNIT * (magnitude / unit + beside)
-        };
-        Tolerances { target: scaled.magnitudes.iter().enumerate().map(bound).collect() }
+        let bound = bound(params, constants, &slices).to_bits();
+        let values = target(params, constants, &slices);
+        let (size, channels, words) = (params.size, params.out_channels, 4 * slices.target.len());
+        Tolerances {
+            target_bound: Tolerance::Exact,
+            target: packed::tolerance(size, channels, &values, bound, words),
+        }
     }
 }

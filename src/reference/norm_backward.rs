@@ -5,7 +5,7 @@ use super::rounding::{Rounded, bounded_reference};
 use crate::kernels::norm_backward::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// The gradient of every value of every channel.
-fn d_source(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {
+pub(super) fn d_source(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {
     let &Params { pixel_count, channel_count, offset, slot } = params;
     let channel = |channel| {
         let affine = affine(slices.values, offset, channel_count, channel);

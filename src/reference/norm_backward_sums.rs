@@ -3,7 +3,11 @@ use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::norm_backward_sums::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// Both sums of every chunk of every channel.
-fn partials(params: &Params, constants: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {
+pub(super) fn partials(
+    params: &Params,
+    constants: &Constants,
+    slices: &Slices<'_>,
+) -> [Vec<Rounded>; 1] {
     let &Params { pixel_count, channel_count, offset, slot } = params;
     let chunk = constants.chunk as usize;
     let channel = |channel| {

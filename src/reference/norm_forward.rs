@@ -3,7 +3,7 @@ use super::rounding::{Rounded, bounded_reference};
 use crate::kernels::norm_forward::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// Every value of every channel.
-fn target(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {
+pub(super) fn target(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {
     let &Params { pixel_count, channel_count, offset, slot } = params;
     let channel = |channel| {
         let affine = affine(slices.values, offset, channel_count, channel);

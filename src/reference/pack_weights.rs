@@ -6,9 +6,9 @@ use crate::kernels::pack_weights::{Constants, Kernel, Params, Slices, Tolerances
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { largest, values, packed } = slices;
+        let Slices { bound, values, packed } = slices;
         let Params { in_channels, out_channels, offset } = *params;
-        let (is_transposed, scale) = (constants.transposed, scale(largest[0]));
+        let (is_transposed, scale) = (constants.transposed, scale(bound[0]));
         let [from, to] =
             if is_transposed { [out_channels, in_channels] } else { [in_channels, out_channels] };
         let [from_padded, to_padded] = [from, to].map(channels);

@@ -3,6 +3,8 @@
 use glam::UVec2;
 use half::f16;
 
+use super::rounding::{Rounded, UNIT};
+use crate::gpu::Tolerance;
 use crate::kernels::packed::{PACKED_CHANNELS, PACKED_COLUMNS, PACKED_ROWS};
 
 /// A map's or a layer's halves, eight in sixteen bytes.
@@ -17,13 +19,18 @@ pub(super) fn extent(size: UVec2) -> UVec2 {
     UVec2::new(x.next_multiple_of(PACKED_COLUMNS), y.next_multiple_of(PACKED_ROWS)) + 2
 }
 
-fn exponent(largest: u32) -> i32 {
-    (largest >> 23).clamp(23, 254) as i32 - 127
+fn exponent(bound: u32) -> i32 {
+    (bound >> 23).clamp(23, 254) as i32 - 127
 }
 
-/// The scale of a factor whose largest magnitude has these bits.
-pub(super) fn scale(largest: u32) -> f64 {
-    f64::from(14 - exponent(largest)).exp2()
+/// The scale of a factor whose bound has these bits.
+pub(super) fn scale(bound: u32) -> f64 {
+    f64::from(14 - exponent(bound)).exp2()
+}
+
+/// The value of a half.
+pub(super) fn half(bits: u16) -> f64 {
+    f16::from_bits(bits).to_f64()
 }
 
 /// The bits of the half nearest to a single, including subnormal, infinite and NaN.
@@ -37,8 +44,7 @@ pub(super) fn eight(number: impl Fn(u32) -> f64) -> Eight {
 }
 
 fn at(packed: &[Eight], index: u32) -> f64 {
-    let half = packed[(index / 8) as usize][(index % 8 / 2) as usize] >> (16 * (index % 2));
-    f16::from_bits(half as u16).to_f64()
+    half((packed[(index / 8) as usize][(index % 8 / 2) as usize] >> (16 * (index % 2))) as u16)
 }
 
 /// The values of a packed map, as planes (C, H, W): halves, which single precision represents exactly.
@@ -48,6 +54,67 @@ pub(super) fn map(size: UVec2, count: u32, packed: &[Eight]) -> Vec<f32> {
     let plane =
         |c: u32| (0..size.element_product()).map(move |i| at(packed, pixel(i) * padded + c));
     (0..count).flat_map(plane).map(|value| value as f32).collect()
+}
+
+/// A packed map with this bound, as planes (C, H, W).
+pub(super) fn unpacked(size: UVec2, count: u32, packed: &[Eight], bound: u32) -> Vec<f32> {
+    let scale = scale(bound);
+    map(size, count, packed).into_iter().map(|value| (f64::from(value) / scale) as f32).collect()
+}
+
+/// Calls `visit(half, value)` for every half of a packed map, or of its pixels alone: with its index, and that among
+/// planes (C, H, W), which halves around the map and beyond its channels do not have.
+fn for_each_half(
+    size: UVec2,
+    count: u32,
+    pixels_alone: bool,
+    mut visit: impl FnMut(usize, Option<usize>),
+) {
+    let (extent, padded) = (extent(size), channels(count));
+    for i in 0..extent.element_product() * padded {
+        let (channel, pixel) = (i % padded, i / padded);
+        let at = UVec2::new(pixel % extent.x, pixel / extent.x).wrapping_sub(UVec2::ONE);
+        let is_pixel = at.x < size.x && at.y < size.y;
+        if is_pixel || !pixels_alone {
+            let value = || ((channel * size.y + at.y) * size.x + at.x) as usize;
+            visit(i as usize, (is_pixel && channel < count).then(value));
+        }
+    }
+}
+
+/// Writes planes (C, H, W) as a packed map with this bound, and unless `pixels_alone` zeros around it.
+pub(super) fn write(
+    size: UVec2,
+    count: u32,
+    planes: &[f64],
+    bound: u32,
+    pixels_alone: bool,
+    packed: &mut [Eight],
+) {
+    let (scale, words) = (scale(bound), packed.as_flattened_mut());
+    for_each_half(size, count, pixels_alone, |half, value| {
+        let (word, shift) = (&mut words[half / 2], 16 * (half as u32 % 2));
+        let bits = nearest(value.map_or(0.0, |value| scale * planes[value]));
+        *word = *word & !(0xffff << shift) | bits << shift;
+    });
+}
+
+/// The tolerance of a map that is written so: the error of its numbers, and that of the nearest halves above and below.
+pub(super) fn tolerance(
+    size: UVec2,
+    count: u32,
+    planes: &[Rounded],
+    bound: u32,
+    words: usize,
+) -> Tolerance {
+    let (scale, mut pairs) = (scale(bound), vec![[0.0; 2]; words]);
+    for_each_half(size, count, true, |half, value| {
+        pairs[half / 2][half % 2] = value.map_or(0.0, |value| {
+            let Rounded { value, error } = planes[value];
+            scale * error + (scale * value.abs() * f64::exp2(-10.0)).max(f64::exp2(-14.0))
+        });
+    });
+    Tolerance::Packed { numbers: vec![], format: half, pairs }
 }
 
 /// The values of a layer's packed weights, as (to, from, tap).
@@ -63,7 +130,7 @@ pub(super) fn weights([from, to]: [u32; 2], packed: &[Eight]) -> Vec<f32> {
 /// magnitudes, all scaled. A matrix unit may truncate instead of rounding additions, and flush subnormal numbers.
 pub(super) fn sum_error(count: u32, magnitude: f64, largest: [f64; 2]) -> f64 {
     let count = f64::from(count);
-    let cut = 4.0 * (count + 2.0) * super::rounding::UNIT * magnitude;
+    let cut = 4.0 * (count + 2.0) * UNIT * magnitude;
     cut + count * f64::exp2(-14.0) * (largest[0] + largest[1])
 }
 

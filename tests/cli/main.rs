@@ -270,11 +270,12 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
     let by_kind = |name: &&str| name.starts_with("ssim") || *name == "adam_gaussian";
     let everywhere = not_covered.iter().copied().filter(|name| !by_kind(name));
     let elsewhere = "\
-        conv3x3_half conv3x3_weight_gradient_half conv_strided \
-        depth_limits expose expose_backward exposure_center exposure_gradient first_not_finite lamp_backward \
-        lamp_gradient largest_magnitude mask_gradient mask_render max_pool motion_vectors normals normals_backward \
-        pack_map pack_pixels pack_weights parameter_terms photograph_light pick_splats place_pairs self_test \
-        smoothing_floor sort_tiles tile_begins";
+        conv3x3_half conv3x3_weight_gradient_half conv_strided depth_limits expose expose_backward \
+        exposure_center exposure_gradient first_not_finite lamp_backward lamp_gradient largest_magnitude \
+        mask_gradient mask_render max_pool motion_vectors norm_backward_half norm_backward_sums_half \
+        norm_forward_half norm_statistics_half normals normals_backward pack_map pack_pixels pack_weights \
+        parameter_terms photograph_light pick_splats place_pairs self_test smoothing_floor sort_tiles \
+        tile_begins unpack_map";
     assert_eq!(everywhere.collect::<Vec<_>>().join(" "), elsewhere);
     let mut named = [keys(&printed["errors"]), not_covered].concat();
     named.sort_unstable();

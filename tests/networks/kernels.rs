@@ -19,7 +19,7 @@ fn check_conv(constants: conv3x3::Constants, [in_channels, out_channels]: [u32; 
         let [source, target] = [in_channels, out_channels].map(|of| image(of * pixels));
         let params = conv3x3::Params { size, in_channels, out_channels, offset };
         let across = size.x.div_ceil(constants.columns * gpu().properties().subgroup_size);
-        let blocks = out_channels.div_ceil(constants.out_block);
+        let blocks = out_channels.div_ceil(constants.out_block * constants.subgroups);
         let threads = Threads::Workgroups([blocks, across, size.y.div_ceil(constants.rows)]);
         run_kernel!(conv3x3, constants, params, threads, [values, source], [target]);
     }
@@ -29,7 +29,7 @@ fn check_conv(constants: conv3x3::Constants, [in_channels, out_channels]: [u32; 
 fn conv3x3_matches_its_reference_forward() {
     let base = conv3x3::Constants { columns: 4, rows: 4, ..Default::default() };
     check_conv(conv3x3::Constants { activation: 1, ..base }, [3, 8]);
-    check_conv(base, [8, 17]);
+    check_conv(conv3x3::Constants { subgroups: 2, ..base }, [8, 17]);
     check_conv(conv3x3::Constants { out_block: 3, activation: 2, ..base }, [17, 3]);
     check_conv(conv3x3::Constants { columns: 1, rows: 8, activation: 1, ..base }, [16, 16]);
 }
@@ -40,14 +40,14 @@ fn conv3x3_matches_its_reference_backward() {
     check_conv(base, [3, 16]);
     check_conv(conv3x3::Constants { accumulate: true, ..base }, [8, 8]);
     check_conv(conv3x3::Constants { out_block: 3, accumulate: true, ..base }, [17, 3]);
-    check_conv(conv3x3::Constants { columns: 1, rows: 8, ..base }, [16, 17]);
+    check_conv(conv3x3::Constants { columns: 1, rows: 8, subgroups: 3, ..base }, [16, 17]);
 }
 
 #[test]
 fn conv3x3_weight_gradient_and_reduce_strips_match_their_references() {
     let mut random = Random::new(2);
-    for (rows, out_block, in_channels, out_channels) in
-        [(16, 8, 3, 8), (4, 8, 8, 17), (16, 3, 16, 3), (5, 8, 17, 16)]
+    for (rows, out_block, subgroups, in_channels, out_channels) in
+        [(16, 8, 1, 3, 8), (4, 8, 8, 8, 17), (16, 3, 4, 16, 3), (5, 8, 3, 17, 16)]
     {
         for size in SIZES.map(UVec2::from_array) {
             let pixels = size.element_product();
@@ -59,9 +59,13 @@ fn conv3x3_weight_gradient_and_reduce_strips_match_their_references() {
             let gradients = image(parameter_count + 9);
             let partials = run_kernel!(
                 conv3x3_weight_gradient,
-                conv3x3_weight_gradient::Constants { rows, out_block },
+                conv3x3_weight_gradient::Constants { rows, out_block, subgroups },
                 conv3x3_weight_gradient::Params { size, in_channels, out_channels },
-                Threads::Workgroups([in_channels, out_channels.div_ceil(out_block), strip_count]),
+                Threads::Workgroups([
+                    in_channels.div_ceil(subgroups),
+                    out_channels.div_ceil(out_block),
+                    strip_count
+                ]),
                 [source, d_target],
                 [partials]
             );

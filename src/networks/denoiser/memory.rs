@@ -4,7 +4,8 @@ use glam::UVec2;
 
 use super::super::conv::{Precision, partial_count};
 use super::super::half::PackedMap;
-use super::super::norm::NormMemory;
+use super::super::norm::{CHUNK, NormMemory};
+use super::super::norm_half::HALF_CHUNK;
 use super::super::reserved::Extent;
 use super::super::{RGB, check_binding, float_bytes};
 use super::DenoiserSettings;
@@ -40,105 +41,125 @@ pub(super) fn check(gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> Resul
 /// The bytes that [`DenoiserMemory::new`] allocates.
 pub(super) fn bytes(settings: DenoiserSettings, extent: Extent) -> u64 {
     let images = settings.stages as usize + 3;
-    let per_pixel = 2 * settings.channels() + images * RGB as usize;
-    let beside = float_bytes(extent.pixels * per_pixel + extent.partials + 4 * extent.packed);
-    beside + Activations::bytes(settings, extent)
+    let gradients = MapCounts::gradients(settings);
+    let beside = extent.pixels * images * RGB as usize + extent.partials;
+    float_bytes(beside + gradients.floats(settings, extent)) + Activations::bytes(settings, extent)
+}
+
+/// The number of maps: in single precision (C, H, W), and packed.
+#[derive(Clone, Copy, Debug)]
+struct MapCounts {
+    features: usize,
+    convolved: usize,
+    packed: usize,
+    packed_convolved: usize,
+}
+
+impl MapCounts {
+    /// Those between the forward and the backward pass of a stage. If they are packed, the first f and the last are in
+    /// single precision too.
+    fn activations(settings: DenoiserSettings) -> Self {
+        let repeats = settings.repeats as usize;
+        match settings.precision {
+            Precision::Single => {
+                Self { features: repeats + 1, convolved: repeats, packed: 0, packed_convolved: 0 }
+            }
+            Precision::Half => {
+                Self { features: 2, convolved: 0, packed: repeats + 1, packed_convolved: repeats }
+            }
+        }
+    }
+
+    /// Those that the backward pass overwrites.
+    fn gradients(settings: DenoiserSettings) -> Self {
+        match settings.precision {
+            Precision::Single => Self { features: 1, convolved: 1, packed: 0, packed_convolved: 0 },
+            Precision::Half => Self { features: 1, convolved: 0, packed: 2, packed_convolved: 1 },
+        }
+    }
+
+    fn floats(self, settings: DenoiserSettings, Extent { pixels, packed, .. }: Extent) -> usize {
+        (self.features + self.convolved) * settings.channels() * pixels
+            + 4 * (self.packed + self.packed_convolved) * packed
+    }
 }
 
 /// State of a stage between its forward and its backward pass.
 #[derive(Debug)]
 pub(super) struct Activations {
-    /// f of every repeat, each (C, H, W); if f is packed, that of the first, and two buffers that alternate for the
-    /// later ones.
-    features: Vec<Buffer<f32>>,
-    /// conv(f) of every repeat, repeats x (C, H, W).
+    /// f of every repeat and the last, each (C, H, W); if f is packed, the first and the last.
+    pub(super) features: Vec<Buffer<f32>>,
+    /// conv(f) of every repeat, each (C, H, W).
     pub(super) convolved: Vec<Buffer<f32>>,
-    /// f of every repeat but the last, packed.
+    /// f of every repeat and the last, packed.
     pub(super) packed: Vec<PackedMap>,
+    /// conv(f) of every repeat, packed.
+    pub(super) packed_convolved: Vec<PackedMap>,
     pub(super) norm: NormMemory,
     /// u, (3, H, W).
     pub(super) update: Buffer<f32>,
 }
 
-/// The number of maps of f: repeats + 1, or three if the backward pass reads the packed form of those between the first
-/// and the last.
-fn feature_maps(settings: DenoiserSettings) -> usize {
-    let all = settings.repeats as usize + 1;
+/// The values of a channel that a subgroup of the norm processes.
+fn chunk(settings: DenoiserSettings) -> u32 {
     match settings.precision {
-        Precision::Single => all,
-        Precision::Half => all.min(3),
+        Precision::Single => CHUNK,
+        Precision::Half => HALF_CHUNK,
     }
 }
 
 impl Activations {
-    /// f of a repeat; if f is packed, only of the first or of the two written last.
-    pub(super) fn features(&self, repeat: usize) -> &Buffer<f32> {
-        &self.features[self.slot(repeat)]
-    }
-
-    /// f of the first repeat, to be written.
-    pub(super) fn first_features(&mut self) -> &mut Buffer<f32> {
-        &mut self.features[0]
-    }
-
-    /// f of the last repeat, and u to be written.
-    pub(super) fn ends(&mut self, repeats: usize) -> (&Buffer<f32>, &mut Buffer<f32>) {
-        let slot = self.slot(repeats);
-        (&self.features[slot], &mut self.update)
-    }
-
-    /// The input of a repeat, and all its outputs.
-    pub(super) fn repeat(&mut self, repeat: usize) -> Repeat<'_> {
-        let [from, to] = [repeat, repeat + 1].map(|repeat| self.slot(repeat));
-        let (before, after) = self.features.split_at_mut(from.max(to));
-        let (shortcut, target) = match from < to {
-            true => (&before[from], &mut after[0]),
-            false => (&after[0], &mut before[to]),
-        };
-        let (convolved, packed) = (&mut self.convolved[repeat], &mut self.packed[repeat]);
-        Repeat { shortcut, packed, convolved, norm: &mut self.norm, target }
-    }
-
-    fn slot(&self, repeat: usize) -> usize {
-        if repeat == 0 { 0 } else { 1 + (repeat - 1) % (self.features.len() - 1) }
-    }
-
     fn new(gpu: &Gpu, settings: DenoiserSettings, extent: Extent) -> Result<Self> {
         let Extent { pixels, packed, .. } = extent;
-        let repeats = settings.repeats as usize;
-        let map = |name| gpu.uninit(name, settings.channels() * pixels);
+        let (channels, repeats) = (settings.channels(), settings.repeats as usize);
+        let of = MapCounts::activations(settings);
+        let map = |name, count| {
+            (0..count).map(|_| gpu.uninit(name, channels * pixels)).collect::<Result<_>>()
+        };
+        let packed = |count| (0..count).map(|_| PackedMap::new(gpu, packed)).collect::<Result<_>>();
         Ok(Self {
-            features: (0..feature_maps(settings))
-                .map(|_| map("features"))
-                .collect::<Result<_>>()?,
-            convolved: (0..repeats).map(|_| map("convolved")).collect::<Result<_>>()?,
-            packed: (0..repeats).map(|_| PackedMap::new(gpu, packed)).collect::<Result<_>>()?,
-            norm: NormMemory::new(gpu, pixels, settings.channels(), repeats)?,
+            features: map("features", of.features)?,
+            convolved: map("convolved", of.convolved)?,
+            packed: packed(of.packed)?,
+            packed_convolved: packed(of.packed_convolved)?,
+            norm: NormMemory::new(gpu, pixels, channels, repeats, chunk(settings))?,
             update: gpu.uninit("update", RGB as usize * pixels)?,
         })
     }
 
     fn bytes(settings: DenoiserSettings, extent: Extent) -> u64 {
-        let (Extent { pixels, packed, .. }, repeats) = (extent, settings.repeats as usize);
-        let maps = feature_maps(settings) + repeats;
-        let per_pixel = maps * settings.channels() + RGB as usize;
-        let norm = NormMemory::floats(pixels, settings.channels(), repeats);
-        float_bytes(pixels * per_pixel + norm + 4 * repeats * packed)
+        let (pixels, repeats) = (extent.pixels, settings.repeats as usize);
+        let norm = NormMemory::floats(pixels, settings.channels(), repeats, chunk(settings));
+        let maps = MapCounts::activations(settings).floats(settings, extent);
+        float_bytes(maps + norm + pixels * RGB as usize)
     }
 }
 
-/// The maps of one repeat.
+/// The gradients of a stage's maps, which its backward pass overwrites.
 #[derive(Debug)]
-pub(super) struct Repeat<'a> {
-    /// f
-    pub(super) shortcut: &'a Buffer<f32>,
-    /// f, packed.
-    pub(super) packed: &'a mut PackedMap,
-    /// conv(f)
-    pub(super) convolved: &'a mut Buffer<f32>,
-    pub(super) norm: &'a mut NormMemory,
-    /// f of the next.
-    pub(super) target: &'a mut Buffer<f32>,
+pub(super) struct StageGradients {
+    /// dL/df, (C, H, W).
+    pub(super) features: Buffer<f32>,
+    /// dL/d conv(f), (C, H, W).
+    pub(super) convolved: Buffer<f32>,
+    /// dL/df of a repeat and of the one after it, alternating, and dL/d conv(f), packed.
+    pub(super) packed: [PackedMap; 3],
+}
+
+impl StageGradients {
+    fn new(
+        gpu: &Gpu,
+        settings: DenoiserSettings,
+        Extent { pixels, packed, .. }: Extent,
+    ) -> Result<Self> {
+        let map = |count| gpu.uninit("gradients", count * settings.channels() * pixels);
+        let packed = || PackedMap::new(gpu, packed);
+        Ok(Self {
+            features: map(1)?,
+            convolved: map(MapCounts::gradients(settings).convolved)?,
+            packed: [packed()?, packed()?, packed()?],
+        })
+    }
 }
 
 /// The activations of the stages before the last, as many as are kept.
@@ -184,10 +205,7 @@ pub(super) struct DenoiserMemory {
     pub(super) activations: Activations,
     /// `R_1` to `R_K`, each (3, H, W).
     pub(super) denoised: Vec<Buffer<f32>>,
-    pub(super) d_features: Buffer<f32>,
-    pub(super) d_convolved: Buffer<f32>,
-    /// dL/d conv(f), packed.
-    pub(super) d_packed: PackedMap,
+    pub(super) gradients: StageGradients,
     pub(super) d_update: Buffer<f32>,
     /// `dL/dR_k`, alternating, each (3, H, W).
     pub(super) d_denoised: [Buffer<f32>; 2],
@@ -196,15 +214,12 @@ pub(super) struct DenoiserMemory {
 
 impl DenoiserMemory {
     pub(super) fn new(gpu: &Gpu, settings: DenoiserSettings, extent: Extent) -> Result<Self> {
-        let Extent { pixels, partials, packed } = extent;
-        let map = |name| gpu.uninit(name, settings.channels() * pixels);
+        let Extent { pixels, partials, .. } = extent;
         let image = |name| gpu.uninit(name, RGB as usize * pixels);
         Ok(Self {
             activations: Activations::new(gpu, settings, extent)?,
             denoised: (0..settings.stages).map(|_| image("denoised")).collect::<Result<_>>()?,
-            d_features: map("d_features")?,
-            d_convolved: map("d_convolved")?,
-            d_packed: PackedMap::new(gpu, packed)?,
+            gradients: StageGradients::new(gpu, settings, extent)?,
             d_update: image("d_update")?,
             d_denoised: [image("d_denoised")?, image("d_denoised")?],
             partials: gpu.uninit("partials", partials)?,
