@@ -35,11 +35,11 @@ printf '{"file_format_version": "1.0.0", "ICD": {"library_path": "%s", "api_vers
 
 # run ARCHITECTURE COMMAND..: on the null device with the compiler of the architecture.
 run() {
-    local architecture=$1 root=$work/trixie-amd64 program driver shim='' own=() set=()
+    local architecture=$1 root=$work/trixie-backports-amd64 program driver shim own=() set=()
     shift
     case $architecture in
         navi21 | vega20) root='' driver=radeon set=(RADV_FORCE_FAMILY="${architecture^^}") ;;
-        navi31 | gfx1201) driver=radeon set=(RADV_FORCE_FAMILY="$architecture") ;;
+        navi31 | gfx1201) driver=radeon shim=amdgpu set=(AMDGPU_GPU_ID="$architecture") ;;
         sm80) driver=nouveau shim=nouveau set=(NOUVEAU_CHIPSET=170) ;;
         sm90) driver=nouveau shim=nouveau set=(NOUVEAU_CHIPSET=180 NVK_I_WANT_A_BROKEN_VULKAN_DRIVER=1) ;;
         dg2-*) driver=intel shim=intel set=(INTEL_STUB_GPU_PLATFORM=dg2 NIGHTSPLAT_SUBGROUP="${architecture#dg2-}") ;;
@@ -51,7 +51,8 @@ run() {
         libraries=$root/usr/lib/$(uname -m)-linux-gnu
         program=$(command -v "$1")
         shift
-        own=("$libraries"/ld-linux-*.so.2 --library-path "$libraries" ${shim:+--preload "$root/$shim.so"} "$program")
+        shim=$libraries/lib${shim}_noop_drm_shim.so
+        own=("$libraries"/ld-linux-*.so.2 --library-path "$libraries" --preload "$shim" "$program")
     fi
     # No layer, no cache that has the results of before, no tiles but the built-in ones, and no test of the results.
     env "${set[@]}" NULL_DEVICE_DRIVER="$libraries/libvulkan_$driver.so" VK_DRIVER_FILES="$work/null-device.json" \
@@ -59,7 +60,7 @@ run() {
         MESA_SHADER_CACHE_DISABLE=true NIGHTSPLAT_TUNE=off NIGHTSPLAT_DEVICE_TEST=off "${own[@]}" "$@"
 }
 
-# Compiles what the bench uses, and what else training does; the matrices of the half precision only some devices have.
+# Compiles what the bench uses, and what else training does; the older devices have no matrices of the half precision.
 compile() {
     run "$1" "$nightsplat" bench --unchecked --repeats 1 --gaussians 1000 || return
     local train=(train "$work/set" --out "$work/run" --overwrite --plan none --steps 2 --sh-degree 3)
@@ -69,17 +70,17 @@ compile() {
     cp "$work/run/model.ply" "$work/model.ply" || return
     local frozen=(--init "$work/model.ply" --freeze means,quats,scales,opacities)
     run "$1" "$nightsplat" "${train[@]}" --model plain "${frozen[@]}" || return
-    # The width of the presets, and the paper's.
-    case $1 in
-        navi31 | gfx1201)
-            run "$1" "$nightsplat" "${train[@]}" --model lita --denoiser-precision half &&
-                run "$1" "$nightsplat" "${train[@]}" --model lita --denoiser-precision half --denoiser-channels 64 ;;
-    esac
+    case $1 in navi21 | vega20) return 0 ;; esac
+    # The width of the presets, and the paper's. No depth: the set has no maps, so its kernels would be compiled ahead,
+    # until that is known, and be as many as chance has it.
+    local half=(--model lita --parts denoiser,tonemapper,structure --denoiser-precision half)
+    run "$1" "$nightsplat" "${train[@]}" "${half[@]}" || return
+    run "$1" "$nightsplat" "${train[@]}" "${half[@]}" --denoiser-channels 64
 }
 
 # The kernels of another device with 64 lanes, by Turnip, whose drivers are for another processor.
 compile_elsewhere() {
-    local root=$work/trixie-arm64 libraries=$work/trixie-arm64/usr/lib/aarch64-linux-gnu kernels=$work/kernels
+    local libraries=$work/trixie-backports-arm64/usr/lib/aarch64-linux-gnu kernels=$work/kernels
     scripts/gpu-compilers/drivers.sh arm64 || return
     aarch64-linux-gnu-gcc -O1 -idirafter /usr/include -o "$work/compile-arm64" scripts/gpu-compilers/compile.c \
         "$libraries/libvulkan.so.1" -Wl,--allow-shlib-undefined || return
@@ -90,9 +91,9 @@ compile_elsewhere() {
     local lines=$NIGHTSPLAT_STATISTICS
     NIGHTSPLAT_STATISTICS=$kernels/lines NULL_DEVICE_KERNELS=$kernels compile vega20 || return
     scripts/gpu-compilers/elsewhere.py "$kernels/lines" "$kernels" qemu-aarch64-static \
-        -E LD_PRELOAD="$root/freedreno.so" -E FD_GPU_ID=730 -E VK_DRIVER_FILES="$work/freedreno.json" \
-        -E MESA_SHADER_CACHE_DISABLE=true "$libraries/ld-linux-aarch64.so.1" --library-path "$libraries" \
-        "$work/compile-arm64" > "$lines"
+        -E LD_PRELOAD="$libraries/libfreedreno_noop_drm_shim.so" -E FD_GPU_ID=730 \
+        -E VK_DRIVER_FILES="$work/freedreno.json" -E MESA_SHADER_CACHE_DISABLE=true \
+        "$libraries/ld-linux-aarch64.so.1" --library-path "$libraries" "$work/compile-arm64" > "$lines"
 }
 
 if [ ! -e "$work/set/normals" ]; then

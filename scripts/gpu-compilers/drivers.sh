@@ -1,14 +1,15 @@
 #!/usr/bin/env bash
-# Unpacks Mesa's Vulkan drivers of Debian 13 into target/gpu-compilers/trixie-amd64, with what they link to, and builds
-# next to them what stands in for the kernel drivers of NVIDIA's and Intel's GPUs: drm-shim, from the same version of
-# Mesa's source. Nothing is installed, and root is not needed. On Debian this takes `apt install gcc dpkg-dev libdrm-dev
-# pkg-config python3-mako xz-utils`.
+# Unpacks Mesa's Vulkan drivers from the backports of Debian 13 into target/gpu-compilers/trixie-backports-amd64, with
+# what they link to and what stands in for kernel drivers: drm-shim. Of NVIDIA's and Intel's GPUs that is built here,
+# from the source of Mesa in Debian 13 itself, which is older: newer drivers run on older kernels too. Nothing is
+# installed, and root is not needed. On Debian this takes `apt install gcc dpkg-dev libdrm-dev pkg-config python3-mako
+# xz-utils`.
 #
-# With the argument arm64: the drivers for that processor, and what stands in for Qualcomm's; `apt install
-# qemu-user-static gcc-aarch64-linux-gnu libc6-dev-arm64-cross`.
+# With the argument arm64: the drivers and stand-ins for that processor, of which nothing is built; to use them, `apt
+# install qemu-user-static gcc-aarch64-linux-gnu libc6-dev-arm64-cross`.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
-suite=trixie
+suite=trixie-backports
 processor=${1:-amd64}
 root=$PWD/target/gpu-compilers/$suite-$processor
 [ ! -e "$root/complete" ] || exit 0
@@ -20,7 +21,7 @@ mkdir -p "$root"/{apt,source}
 
 mirror=http://deb.debian.org/debian
 signed=[signed-by=/usr/share/keyrings/debian-archive-keyring.gpg]
-printf "%s $signed $mirror $suite main\n" deb deb-src > "$root/apt/sources.list"
+printf "%s $signed $mirror %s main\n" deb $suite deb trixie deb-src trixie > "$root/apt/sources.list"
 mkdir -p "$root"/apt/{lists,archives}/partial "$root/apt/none"
 : > "$root/apt/status"
 apt() {
@@ -30,13 +31,18 @@ apt() {
         -o APT::Install-Recommends=0 -o APT::Architecture="$processor" -o APT::Architectures="$processor" "$@"
 }
 apt update
-apt --yes --download-only install mesa-vulkan-drivers libvulkan1 > /dev/null
+apt --yes --download-only install --target-release $suite mesa-vulkan-drivers mesa-drm-shim libvulkan1 > /dev/null
 for package in "$root"/apt/archives/*.deb; do dpkg-deb --extract "$package" "$root"; done
+if [ "$processor" = arm64 ]; then
+    rm -rf "$root"/{apt,source}
+    touch "$root/complete"
+    exit 0
+fi
 (cd "$root/source" && apt --download-only source mesa > /dev/null)
 tar -xf "$root"/source/mesa_*.orig.tar.xz -C "$root/source" --strip-components=1
 
 # ---------------------------------------------------------------------------
-# What stands in for the kernel drivers
+# What stands in for the kernel drivers of newer GPUs than the package knows, and of those it leaves out
 
 cd "$root/source"
 # The GPUs since Ampere, by their classes in NVIDIA's open documentation; and what NVK asks of the kernel beside.
@@ -59,7 +65,7 @@ of_chip="OF_CHIP(ga100,ga102,gh100,ad102)=($chip>=0x190?ad102:$chip>=0x180?gh100
 
 # shim NAME SOURCE..: with the parts of Mesa that both need.
 shim() {
-    local name=$1 compiler=gcc libdrm=-ldrm define defines=() util=() has
+    local name=$1 define defines=() util=() has
     shift
     for has in PTHREAD STRUCT_TIMESPEC FUNC_ATTRIBUTE_PACKED FUNC_ATTRIBUTE_CONST FUNC_ATTRIBUTE_WARN_UNUSED_RESULT \
         __BUILTIN_EXPECT __BUILTIN_UNREACHABLE ENDIAN_H LINUX_FUTEX_H DLADDR DL_ITERATE_PHDR SECURE_GETENV \
@@ -73,20 +79,11 @@ shim() {
         u_call_once u_debug u_printf u_process vma; do
         util+=("src/util/$has.c")
     done
-    if [ "$processor" = arm64 ]; then
-        compiler=aarch64-linux-gnu-gcc libdrm=$root/usr/lib/aarch64-linux-gnu/libdrm.so.2
-    fi
-    "$compiler" -O1 -w -fPIC -shared -fvisibility=hidden "${defines[@]}" -I src -I include -I include/drm-uapi \
+    gcc -O1 -w -fPIC -shared -fvisibility=hidden "${defines[@]}" -I src -I include -I include/drm-uapi \
         -Isrc/intel -Isrc/intel/common -Isrc/intel/dev -Isrc/intel/dev/i915 -Isrc/util $(pkg-config --cflags libdrm) \
-        -Wl,-z,defs -o "$root/$name.so" src/drm-shim/{device,drm_shim}.c src/c11/impl/{threads_posix,time}.c \
-        "${util[@]}" "$@" "$libdrm" -ldl -lpthread -lm
+        -Wl,-z,defs -o "$root/usr/lib/x86_64-linux-gnu/lib${name}_noop_drm_shim.so" src/drm-shim/{device,drm_shim}.c \
+        src/c11/impl/{threads_posix,time}.c "${util[@]}" "$@" -ldrm -ldl -lpthread -lm
 }
-if [ "$processor" = arm64 ]; then
-    shim freedreno src/freedreno/drm-shim/freedreno_noop.c
-    rm -rf "$root"/{apt,source}
-    touch "$root/complete"
-    exit 0
-fi
 shim nouveau src/nouveau/drm-shim/nouveau_noop.c
 intel=src/intel/dev
 shim intel src/intel/tools/intel_noop_drm_shim.c $intel/intel_{device_info,device_info_serialize_gen}.c \

@@ -4,7 +4,7 @@
 //
 // NULL_DEVICE_DRIVER is the path of the real driver, which must be able to open its device: Mesa's can, by
 // RADV_FORCE_FAMILY or with a kernel interface that is preloaded. Each pipeline whose statistics are asked for is
-// written to the folder NULL_DEVICE_KERNELS, if that is set: N.spv, and a line of the file `list` with N.spv, the
+// written to the folder NULL_DEVICE_KERNELS, if it is set: PROCESS-N.spv, and a line of the file `list` with that, the
 // required subgroup size, and its specialization constants as id=bits.
 
 #define _GNU_SOURCE
@@ -14,6 +14,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
+#include <unistd.h>
 #include <vulkan/vk_icd.h>
 #include <vulkan/vulkan.h>
 
@@ -208,6 +209,9 @@ static VkResult create_module(VkDevice device, const VkShaderModuleCreateInfo *i
                               const VkAllocationCallbacks *callbacks, VkShaderModule *module) {
     VkResult result = real_create_module(device, info, callbacks, module);
     unsigned at = __atomic_fetch_add(&modules, 1, __ATOMIC_RELAXED) % (sizeof latest / sizeof *latest);
+    // One that was destroyed may have had the same handle.
+    for (size_t i = 0; result == VK_SUCCESS && i < sizeof latest / sizeof *latest; i++)
+        if (latest[i].module == *module) latest[i].module = VK_NULL_HANDLE;
     if (result == VK_SUCCESS && getenv("NULL_DEVICE_KERNELS")) {
         latest[at].module = *module;
         latest[at].size = info->codeSize;
@@ -220,7 +224,7 @@ static VkResult create_module(VkDevice device, const VkShaderModuleCreateInfo *i
 static void write_pipeline(const char *folder, const VkPipelineShaderStageCreateInfo *stage) {
     static unsigned number;
     char path[4096];
-    snprintf(path, sizeof path, "%s/%u.spv", folder, number);
+    snprintf(path, sizeof path, "%s/%d-%u.spv", folder, getpid(), number);
     FILE *file = fopen(path, "wb");
     for (size_t i = 0; file && i < sizeof latest / sizeof *latest; i++)
         if (latest[i].module == stage->module) {
@@ -237,7 +241,7 @@ static void write_pipeline(const char *folder, const VkPipelineShaderStageCreate
             lanes = ((const VkPipelineShaderStageRequiredSubgroupSizeCreateInfo *)next)->requiredSubgroupSize;
     // A device of one size is not told it.
     if (!lanes && stage->flags & VK_PIPELINE_SHADER_STAGE_CREATE_REQUIRE_FULL_SUBGROUPS_BIT) lanes = 64;
-    fprintf(list, "%u.spv %u", number++, lanes);
+    fprintf(list, "%d-%u.spv %u", getpid(), number++, lanes);
     const VkSpecializationInfo *constants = stage->pSpecializationInfo;
     for (uint32_t i = 0; constants && i < constants->mapEntryCount; i++) {
         uint32_t bits;

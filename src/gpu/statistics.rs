@@ -74,6 +74,8 @@ impl Resources {
                 "Fills from memory",
                 "Spill Count",
                 "Fill Count",
+                "Spills",
+                "Fills",
                 "STP Count",
                 "LDP Count",
             ]),
@@ -220,28 +222,26 @@ mod tests {
             ("Max live registers", 84.0),
             ("Workgroup Memory Size", 256.0),
         ];
+        let anv_of_26 = [("Instructions", 862.0), ("Spills", 3.0), ("Fills", 4.0)];
+        let read = |statistics: &[(&str, f64)]| Resources::from_statistics(&told(statistics));
         let resources = |numbers: [Option<f64>; 5]| {
             let [registers, spills, scratch, shared, instructions] = numbers;
             Resources { registers, spills, scratch, shared, instructions }
         };
-        assert_eq!(
-            Resources::from_statistics(&told(&radv)),
-            resources([80.0, 3.0, 64.0, 512.0, 869.0].map(Some))
-        );
+        assert_eq!(read(&radv), resources([80.0, 3.0, 64.0, 512.0, 869.0].map(Some)));
         let expected = resources([Some(138.0), None, Some(0.0), None, Some(1233.0)]);
-        assert_eq!(Resources::from_statistics(&told(&nvk)), expected);
-        assert_eq!(
-            Resources::from_statistics(&told(&anv)),
-            resources([84.0, 7.0, 1024.0, 256.0, 862.0].map(Some))
-        );
+        assert_eq!(read(&nvk), expected);
+        assert_eq!(read(&anv), resources([84.0, 7.0, 1024.0, 256.0, 862.0].map(Some)));
+        let expected = resources([None, Some(7.0), None, None, Some(862.0)]);
+        assert_eq!(read(&anv_of_26), expected);
         let nvidia = [
             ("Register Count", 44.0),
             ("Local Memory Size", 16.0 * 2f64.powi(32) + 16.0),
             ("Shared Memory Size", 0.0),
         ];
         let expected = resources([Some(44.0), None, Some(16.0), Some(0.0), None]);
-        assert_eq!(Resources::from_statistics(&told(&nvidia)), expected);
-        assert_eq!(Resources::from_statistics(&[]), Resources::default());
+        assert_eq!(read(&nvidia), expected);
+        assert_eq!(read(&[]), Resources::default());
     }
 
     #[test]
