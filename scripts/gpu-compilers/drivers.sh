@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # Unpacks Mesa's Vulkan drivers from the backports of Debian 13 into target/gpu-compilers/trixie-backports-amd64, with
-# what they link to and what stands in for kernel drivers: drm-shim. Of NVIDIA's and Intel's GPUs that is built here,
-# from the source of Mesa in Debian 13 itself, which is older: newer drivers run on older kernels too. Nothing is
-# installed, and root is not needed. On Debian this takes `apt install gcc dpkg-dev libdrm-dev pkg-config python3-mako
-# xz-utils`.
+# what they link to, validation layers, and what stands in for kernel drivers: drm-shim. Of NVIDIA's and Intel's GPUs
+# that is built here, from the source of Mesa in Debian 13 itself, which is older: newer drivers run on older kernels
+# too. Nothing is installed, and root is not needed. On Debian this takes `apt install gcc dpkg-dev libdrm-dev
+# pkg-config python3-mako xz-utils`.
 #
 # With the argument arm64: the drivers and stand-ins for that processor, of which nothing is built; to use them, `apt
 # install qemu-user-static gcc-aarch64-linux-gnu libc6-dev-arm64-cross`.
@@ -31,7 +31,8 @@ apt() {
         -o APT::Install-Recommends=0 -o APT::Architecture="$processor" -o APT::Architectures="$processor" "$@"
 }
 apt update
-apt --yes --download-only install --target-release $suite mesa-vulkan-drivers mesa-drm-shim libvulkan1 > /dev/null
+apt --yes --download-only install --target-release $suite mesa-vulkan-drivers mesa-drm-shim libvulkan1 \
+    vulkan-validationlayers > /dev/null
 for package in "$root"/apt/archives/*.deb; do dpkg-deb --extract "$package" "$root"; done
 if [ "$processor" = arm64 ]; then
     rm -rf "$root"/{apt,source}

@@ -16,11 +16,10 @@
 //! bits, sums in single precision.
 //!
 //! d_weight(M out, N in) of tap t += d_target(M out, K pixels) input_t(K pixels, N in) for every K pixels of every row
-//! of a strip, both packed. A subgroup owns a matrix of output channels by one of input channels, for all nine
-//! taps, and slides a window of three rows down K columns after K columns: a matrix of input is loaded once. Two
-//! matrices of output channels would spill (compiled by Mesa 25 for Navi 31). The SUBGROUPS of a workgroup have the
-//! next input channels, and find the gradient of the output in the cache. `pack_map` states the rounding error.
-//! Reference: `src/reference/conv3x3_weight_gradient_half.rs`.
+//! of a strip, both packed. A subgroup owns a matrix of output channels by one of input channels, for all nine taps,
+//! and goes down K columns after K columns: a matrix of input is loaded once, and meets the gradients of the three rows
+//! around it. The SUBGROUPS of a workgroup have the next input channels, and find the gradients in the cache.
+//! `pack_map` states the rounding error. Reference: `src/reference/conv3x3_weight_gradient_half.rs`.
 
 layout(local_size_x_id = 100, local_size_y_id = 4) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -67,24 +66,21 @@ void main() {
         sum[t] = coopmat<float, gl_ScopeSubgroup, M, N, gl_MatrixUseAccumulator>(0.0);
 
     for (uint first = 0; first < size.x; first += K) {
-        // Rows of the packed map, whose first is above the image.
-        coopmat<float16_t, gl_ScopeSubgroup, K, N, gl_MatrixUseB> window[3][3];
-        [[unroll]] for (uint r = 0; r < 2; ++r)
-            [[unroll]] for (uint c = 0; c < 3; ++c)
-                coopMatLoad(window[r][c], source, ((top + r) * columns + first + c) * from + first_in, from,
-                    gl_CooperativeMatrixLayoutRowMajor);
-        for (uint y = top; y < end; ++y) {
-            [[unroll]] for (uint c = 0; c < 3; ++c)
-                coopMatLoad(window[2][c], source, ((y + 2) * columns + first + c) * from + first_in, from,
-                    gl_CooperativeMatrixLayoutRowMajor);
-            coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> factor;
-            coopMatLoad(factor, d_target, ((y + 1) * columns + first + 1) * to + first_out, to,
-                gl_CooperativeMatrixLayoutColumnMajor);
-            [[unroll]] for (uint t = 0; t < TAPS; ++t)
-                sum[t] = coopMatMulAdd(factor, window[t / 3][t % 3], sum[t]);
+        // Of rows y, y - 1, y - 2 of the output; row y of the packed input is above row y of the output.
+        coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> gradients[3];
+        for (uint y = top; y < end + 2; ++y) {
+            gradients[2] = gradients[1];
+            gradients[1] = gradients[0];
+            if (y < end)
+                coopMatLoad(gradients[0], d_target, ((y + 1) * columns + first + 1) * to + first_out, to,
+                    gl_CooperativeMatrixLayoutColumnMajor);
             [[unroll]] for (uint c = 0; c < 3; ++c) {
-                window[0][c] = window[1][c];
-                window[1][c] = window[2][c];
+                coopmat<float16_t, gl_ScopeSubgroup, K, N, gl_MatrixUseB> neighbours;
+                coopMatLoad(neighbours, source, (y * columns + first + c) * from + first_in, from,
+                    gl_CooperativeMatrixLayoutRowMajor);
+                [[unroll]] for (uint r = 0; r < 3; ++r)
+                    if (y >= top + r && y < end + r)
+                        sum[3 * r + c] = coopMatMulAdd(gradients[r], neighbours, sum[3 * r + c]);
             }
         }
     }

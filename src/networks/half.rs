@@ -12,9 +12,13 @@ use crate::kernels::{
     unpack_map,
 };
 
-/// Subgroups of a workgroup, and matrices of output channels per subgroup, times four rows of pixels: sixteen sums in
-/// registers. The first whose pixels and weights fit shared memory is taken.
-const SHAPES: [[u32; 2]; 4] = [[4, 4], [4, 2], [2, 2], [1, 1]];
+/// Subgroups of a workgroup, and matrices of output channels per subgroup, times four rows of pixels. The first whose
+/// pixels and weights fit shared memory, and whose sums fit the registers, is taken.
+const SHAPES: [[u32; 2]; 5] = [[4, 4], [4, 2], [4, 1], [2, 2], [1, 1]];
+
+/// Values of a matrix for each matrix of output channels: devices with small matrices have few registers (compiled by
+/// Mesa 26 for Arc).
+const BLOCK_VALUES: u32 = 64;
 
 /// Values per subgroup of the search for the largest magnitude.
 const CHUNK: u32 = 2048;
@@ -102,6 +106,7 @@ impl HalfConv {
         let device = gpu.properties();
         let fits = |shape: &[u32; 2]| {
             shared_bytes(*shape, matrix) <= device.max_shared_memory
+                && shape[1] * BLOCK_VALUES <= m * n
                 && shape[0] * device.subgroup_size <= WORKGROUP_THREADS
         };
         let [subgroups, blocks] = SHAPES.into_iter().find(fits).unwrap_or(SHAPES[SHAPES.len() - 1]);
