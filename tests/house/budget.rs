@@ -111,7 +111,7 @@ const BUDGET: &[(&str, usize, &str)] = &[
     ),
     (
         "scripts",
-        6389,
+        6390,
         "Measurements, the paper, packages, releases, pictures, mutants, GPU compilers, matrices, checks of others.",
     ),
     (
