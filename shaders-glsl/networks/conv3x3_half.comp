@@ -90,18 +90,19 @@ void main() {
         stage(origin, first_channel, first);
         barrier();
         [[unroll]] for (uint column = 0; column < 3; ++column) {
-            coopmat<float16_t, gl_ScopeSubgroup, K, N, gl_MatrixUseB> neighbours[PACKED_ROWS + 2];
-            [[unroll]] for (uint r = 0; r < PACKED_ROWS + 2; ++r)
-                coopMatLoad(neighbours[r], pixels, ((row + r) * COLUMNS + column) * STEP, STEP,
-                    gl_CooperativeMatrixLayoutColumnMajor);
-            [[unroll]] for (uint tap = 0; tap < 3; ++tap) {
-                [[unroll]] for (uint b = 0; b < BLOCKS; ++b) {
-                    coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> factor;
-                    coopMatLoad(factor, factors, ((3 * tap + column) * CHANNELS + b * M) * STEP, STEP,
+            coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> taps[BLOCKS][3];
+            [[unroll]] for (uint b = 0; b < BLOCKS; ++b)
+                [[unroll]] for (uint t = 0; t < 3; ++t)
+                    coopMatLoad(taps[b][t], factors, ((3 * t + column) * CHANNELS + b * M) * STEP, STEP,
                         gl_CooperativeMatrixLayoutRowMajor);
-                    [[unroll]] for (uint r = 0; r < PACKED_ROWS; ++r)
-                        sum[b][r] = coopMatMulAdd(factor, neighbours[r + tap], sum[b][r]);
-                }
+            [[unroll]] for (uint r = 0; r < PACKED_ROWS + 2; ++r) {
+                coopmat<float16_t, gl_ScopeSubgroup, K, N, gl_MatrixUseB> neighbours;
+                coopMatLoad(neighbours, pixels, ((row + r) * COLUMNS + column) * STEP, STEP,
+                    gl_CooperativeMatrixLayoutColumnMajor);
+                [[unroll]] for (uint t = 0; t < 3; ++t)
+                    if (r >= t && r < PACKED_ROWS + t)
+                        [[unroll]] for (uint b = 0; b < BLOCKS; ++b)
+                            sum[b][r - t] = coopMatMulAdd(taps[b][t], neighbours, sum[b][r - t]);
             }
         }
     }

@@ -144,25 +144,17 @@ fn observations(
     // One photograph at a time, since they may have to be read again.
     for (index, ((_, view), shown)) in views.iter().zip(of_view).enumerate() {
         let Some(image) = view.loaded()? else { continue };
-        for point in shown {
-            let at = pixel(&view.camera, points[point]);
-            let Some((light, is_clipped)) = at.and_then(|at| light_around(&image, at)) else {
-                continue;
-            };
+        let observation = |&point: &usize| {
+            let at = pixel(&view.camera, points[point])?;
+            let (light, is_clipped) = light_around(&image, at)?;
             let in_view = view.camera.view_from_world.transform_point3(points[point].position);
             let distance = in_view.length();
             let off_axis = 1.0 - in_view.z / distance;
-            let (light, height) = (light.log2(), f64::from(view.camera.height));
-            let row = at.map_or(0.0, |at| at.y / height);
-            lights[point].push(Observation {
-                view: index,
-                light,
-                distance,
-                off_axis,
-                row,
-                is_clipped,
-            });
-        }
+            let (light, row) = (light.log2(), at.y / f64::from(view.camera.height));
+            Some((point, Observation { view: index, light, distance, off_axis, row, is_clipped }))
+        };
+        let of_view: Vec<_> = shown.par_iter().filter_map(observation).collect();
+        of_view.into_iter().for_each(|(point, seen)| lights[point].push(seen));
     }
     lights.retain(|seen| seen.len() >= 2);
     Ok(lights)
