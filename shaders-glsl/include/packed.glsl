@@ -15,7 +15,7 @@ uvec2 packed_size(uvec2 size) {
     return (size + unit - 1) / unit * unit + 2;
 }
 
-// Eights of a packed pixel before that at `at`.
+// The first eight channels of the pixel at `at`, as an index of eights.
 uint packed_index(uvec2 size, uint channels, uvec2 at) {
     return ((at.y + 1) * packed_size(size).x + at.x + 1) * (packed_channels(channels) / 8);
 }

@@ -16,10 +16,11 @@
 //! bits, sums in single precision.
 //!
 //! d_weight(M out, N in) of tap t += d_target(M out, K pixels) input_t(K pixels, N in) for every K pixels of every row
-//! of a strip, both packed. A subgroup owns a matrix of output channels by one of input channels, for all nine taps,
-//! and goes down K columns after K columns: a matrix of input is loaded once, and meets the gradients of the three rows
-//! around it. The SUBGROUPS of a workgroup have the next input channels, and find the gradients in the cache.
-//! `pack_map` states the rounding error. Reference: `src/reference/conv3x3_weight_gradient_half.rs`.
+//! of a strip, both packed. A subgroup owns a matrix of output channels by one of input channels. For the taps of
+//! TAP_COLUMNS columns at a time it goes down K columns of the image after K columns: a matrix of input is loaded once,
+//! and meets the gradients of the three rows around it. The SUBGROUPS of a workgroup have the next input channels, and
+//! find the gradients in the cache. `pack_map` states the rounding error. Reference:
+//! `src/reference/conv3x3_weight_gradient_half.rs`.
 
 layout(local_size_x_id = 100, local_size_y_id = 4) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -28,6 +29,7 @@ layout(constant_id = 1) const uint N = 8;       // input channels of a matrix
 layout(constant_id = 2) const uint K = 8;       // pixels of a matrix, side by side
 layout(constant_id = 3) const uint ROWS = 4;    // of a strip
 layout(constant_id = 4) const uint SUBGROUPS = 1;
+layout(constant_id = 5) const uint TAP_COLUMNS = 3;  // 1 or 3: sums in registers
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;  // pixels
@@ -61,43 +63,48 @@ void main() {
     uint top = gl_WorkGroupID.z * ROWS;
     uint end = min(top + ROWS, size.y);
 
-    coopmat<float, gl_ScopeSubgroup, M, N, gl_MatrixUseAccumulator> sum[TAPS];
-    [[unroll]] for (uint t = 0; t < TAPS; ++t)
-        sum[t] = coopmat<float, gl_ScopeSubgroup, M, N, gl_MatrixUseAccumulator>(0.0);
-
-    for (uint first = 0; first < size.x; first += K) {
-        // Of rows y, y - 1, y - 2 of the output; row y of the packed input is above row y of the output.
-        coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> gradients[3];
-        for (uint y = top; y < end + 2; ++y) {
-            gradients[2] = gradients[1];
-            gradients[1] = gradients[0];
-            if (y < end)
-                coopMatLoad(gradients[0], d_target, ((y + 1) * columns + first + 1) * to + first_out, to,
-                    gl_CooperativeMatrixLayoutColumnMajor);
-            [[unroll]] for (uint c = 0; c < 3; ++c) {
-                coopmat<float16_t, gl_ScopeSubgroup, K, N, gl_MatrixUseB> neighbours;
-                coopMatLoad(neighbours, source, (y * columns + first + c) * from + first_in, from,
-                    gl_CooperativeMatrixLayoutRowMajor);
-                [[unroll]] for (uint r = 0; r < 3; ++r)
-                    if (y >= top + r && y < end + r)
-                        sum[3 * r + c] = coopMatMulAdd(gradients[r], neighbours, sum[3 * r + c]);
-            }
-        }
-    }
-
     uint set = gl_WorkGroupID.z * TAPS * in_channels * out_channels;
     uint first_sum = gl_SubgroupID * M * N;
-    [[unroll]] for (uint t = 0; t < TAPS; ++t) {
-        barrier();
-        coopMatStore(sum[t], sums, first_sum, N, gl_CooperativeMatrixLayoutRowMajor);
-        barrier();
-        // Unrolled: around a loop that stays one, the index of a matrix is no constant and moves all to memory.
-        [[unroll]] for (uint k = 0; k < M * N; k += SUBGROUP_SIZE) {
-            uint i = k + gl_SubgroupInvocationID;
-            uint channel = first_out + i / N, other = first_in + i % N;
-            if (i < M * N && is_channel && channel < out_channels && other < in_channels)
-                partials[set + (channel * in_channels + other) * TAPS + t] = unpacked(sums[first_sum + i],
-                    d_target_bound[0], source_bound[0]);
+    for (uint column = 0; column < 3; column += TAP_COLUMNS) {
+        coopmat<float, gl_ScopeSubgroup, M, N, gl_MatrixUseAccumulator> sum[3][TAP_COLUMNS];
+        [[unroll]] for (uint r = 0; r < 3; ++r)
+            [[unroll]] for (uint c = 0; c < TAP_COLUMNS; ++c)
+                sum[r][c] = coopmat<float, gl_ScopeSubgroup, M, N, gl_MatrixUseAccumulator>(0.0);
+
+        for (uint first = 0; first < size.x; first += K) {
+            // Of rows y, y - 1, y - 2 of the output; row y of the packed input is above row y of the output.
+            coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> gradients[3];
+            for (uint y = top; y < end + 2; ++y) {
+                gradients[2] = gradients[1];
+                gradients[1] = gradients[0];
+                if (y < end)
+                    coopMatLoad(gradients[0], d_target, ((y + 1) * columns + first + 1) * to + first_out, to,
+                        gl_CooperativeMatrixLayoutColumnMajor);
+                [[unroll]] for (uint c = 0; c < TAP_COLUMNS; ++c) {
+                    coopmat<float16_t, gl_ScopeSubgroup, K, N, gl_MatrixUseB> neighbours;
+                    coopMatLoad(neighbours, source, (y * columns + first + column + c) * from + first_in, from,
+                        gl_CooperativeMatrixLayoutRowMajor);
+                    [[unroll]] for (uint r = 0; r < 3; ++r)
+                        if (y >= top + r && y < end + r)
+                            sum[r][c] = coopMatMulAdd(gradients[r], neighbours, sum[r][c]);
+                }
+            }
+        }
+
+        [[unroll]] for (uint r = 0; r < 3; ++r) {
+            [[unroll]] for (uint c = 0; c < TAP_COLUMNS; ++c) {
+                barrier();
+                coopMatStore(sum[r][c], sums, first_sum, N, gl_CooperativeMatrixLayoutRowMajor);
+                barrier();
+                // Unrolled: around a loop that stays one, the index of a matrix is no constant and moves all to memory.
+                [[unroll]] for (uint k = 0; k < M * N; k += SUBGROUP_SIZE) {
+                    uint i = k + gl_SubgroupInvocationID;
+                    uint channel = first_out + i / N, other = first_in + i % N;
+                    if (i < M * N && is_channel && channel < out_channels && other < in_channels)
+                        partials[set + (channel * in_channels + other) * TAPS + 3 * r + column + c] =
+                            unpacked(sums[first_sum + i], d_target_bound[0], source_bound[0]);
+                }
+            }
         }
     }
 }

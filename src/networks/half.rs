@@ -131,6 +131,7 @@ impl HalfConv {
                 k,
                 rows: HALF_STRIP_ROWS,
                 subgroups: gradient_subgroups,
+                tap_columns: if m * n < 3 * BLOCK_VALUES { 1 } else { 3 },
             })?,
             gradient_subgroups,
             reduce: Reduce::new(gpu)?,

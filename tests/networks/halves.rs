@@ -261,11 +261,12 @@ fn conv3x3_weight_gradient_half_matches_its_reference_at_every_magnitude() {
             let (source_bound, source) = packed(size, in_channels, &source);
             let (d_target_bound, d_target) = packed(size, out_channels, &d_target);
             let strips = size.y.div_ceil(rows);
+            let tap_columns = if subgroups == 1 { 3 } else { 1 };
             let across = in_channels.next_multiple_of(PACKED_CHANNELS).div_ceil(n * subgroups);
             let partials = vec![f32::NAN; (strips * out_channels * 9 * in_channels) as usize];
             run_kernel!(
                 conv3x3_weight_gradient_half,
-                conv3x3_weight_gradient_half::Constants { m, n, k, rows, subgroups },
+                conv3x3_weight_gradient_half::Constants { m, n, k, rows, subgroups, tap_columns },
                 conv3x3_weight_gradient_half::Params { size, in_channels, out_channels },
                 Threads::Workgroups([across, out_channels.div_ceil(m), strips]),
                 [source_bound, d_target_bound, source, d_target],
