@@ -106,7 +106,7 @@ const BUDGET: &[(&str, usize, &str)] = &[
     ),
     (
         "shaders-glsl",
-        7117,
+        7118,
         "The kernels, with a sort of each tile, staged batches, networks on packed maps, picks, motion, normals.",
     ),
     (
