@@ -12,10 +12,9 @@ use nightsplat_photographs::dataset::{Dataset, Point, View};
 use nightsplat_photographs::image::Image;
 
 use super::config::TrainConfig;
-use super::patches::put_together;
 use super::streams;
 use super::views::{ImageKind, TrainView, TrainingPhotograph, Views};
-use crate::gpu::{Download, Gpu};
+use crate::gpu::Gpu;
 use crate::networks::NetworkVariant;
 use crate::splats::lamp::Lamp;
 use crate::targets::pseudo_gt::PseudoGt;
@@ -148,63 +147,40 @@ impl Views {
     }
 }
 
-/// Targets of the photographs in order, made in batches, of which the device makes the next meanwhile.
+/// Targets of the photographs in order, made in batches.
 struct ImageBatches<'a> {
     views: &'a Views,
     pseudo_gt: &'a PseudoGt,
     kind: ImageKind,
     made: BTreeMap<TrainingPhotograph, Image>,
-    next: Option<ImageBatch<'a>>,
-}
-
-/// Patches of photographs, and their downloads.
-struct ImageBatch<'a> {
-    patches: &'a [TrainView],
-    downloads: Vec<Download<f32>>,
 }
 
 impl<'a> ImageBatches<'a> {
     fn new(views: &'a Views, pseudo_gt: &'a PseudoGt, kind: ImageKind) -> Self {
-        Self { views, pseudo_gt, kind, made: BTreeMap::new(), next: None }
+        Self { views, pseudo_gt, kind, made: BTreeMap::new() }
     }
 
     /// The target of a photograph; earlier ones are dropped.
     fn next(&mut self, photograph: TrainingPhotograph) -> Result<Image> {
-        if !self.made.contains_key(&photograph) {
-            let holds = |batch: &ImageBatch<'_>| batch.patches[0].photograph == photograph;
-            let batch = match self.next.take().filter(holds) {
-                Some(batch) => Some(batch),
-                None => self.begin(photograph)?,
-            };
-            if let Some(ImageBatch { patches, downloads }) = batch {
-                let after = patches[patches.len() - 1].photograph.0 + 1;
-                self.next = self.begin(TrainingPhotograph(after))?;
-                let parts = downloads.into_iter().map(Download::wait).collect::<Result<_>>()?;
-                let firsts = patches.iter().filter(|view| view.patch.is_first());
-                let images = put_together(patches, parts);
-                self.made = firsts.map(|view| view.photograph).zip(images).collect();
-            }
-        }
-        let gone = || Error::Usage(format!("there is no training photograph {}", photograph.0));
-        self.made.remove(&photograph).ok_or_else(gone)
-    }
-
-    /// The batch from the first photograph that is not before this one; `None` after the last.
-    fn begin(&self, photograph: TrainingPhotograph) -> Result<Option<ImageBatch<'a>>> {
         /// The pixels of a batch.
         const MAX_PIXELS: usize = 1 << 20;
-        let (views, mut pixels) = (self.views, 0);
-        let whole = views.whole();
-        let after = &whole[whole.partition_point(|view| view.photograph < photograph)..];
-        let now = after.iter().filter(|view| view.patch.is_first()).take_while(|view| {
-            let is_first = pixels == 0;
-            pixels += Patch::from(&view.patch.camera).pixel_count();
-            is_first || pixels <= MAX_PIXELS
-        });
-        let Some(last) = now.last() else { return Ok(None) };
-        let patches = views.of_photographs(after[0].photograph..=last.photograph);
-        let downloads = views.download(self.pseudo_gt, patches, self.kind)?;
-        Ok(Some(ImageBatch { patches, downloads }))
+        let Self { views, pseudo_gt, kind, ref mut made } = *self;
+        if !made.contains_key(&photograph) {
+            let mut pixels = 0;
+            let whole = views.whole();
+            let after = &whole[whole.partition_point(|view| view.photograph < photograph)..];
+            let after = after.iter().filter(|view| view.patch.is_first());
+            let now = after.take_while(|view| {
+                let is_first = pixels == 0;
+                pixels += Patch::from(&view.patch.camera).pixel_count();
+                is_first || pixels <= MAX_PIXELS
+            });
+            let last = now.last().map_or(photograph, |view| view.photograph);
+            let images = views.pictures(pseudo_gt, photograph..=last, kind)?;
+            *made = (photograph.0..).map(TrainingPhotograph).zip(images).collect();
+        }
+        let gone = || Error::Usage(format!("there is no training photograph {}", photograph.0));
+        made.remove(&photograph).ok_or_else(gone)
     }
 }
 

@@ -226,13 +226,13 @@ impl Views {
         view.gets_curve.then_some((&self.curves, view.photograph.0 as u32))
     }
 
-    /// Makes targets or dark photographs of views, (3, H, W), in one submission, and brings them to the host.
-    pub(super) fn download(
+    /// Reads back targets or dark photographs of views, (3, H, W), in one submission.
+    pub(super) fn read(
         &self,
         pseudo_gt: &PseudoGt,
         views: &[TrainView],
         kind: ImageKind,
-    ) -> Result<Vec<Download<f32>>> {
+    ) -> Result<Vec<Vec<f32>>> {
         let gpu = pseudo_gt.gpu();
         let (mut stored, mut scratch) = (vec![], vec![]);
         for view in views {
@@ -250,17 +250,7 @@ impl Views {
             }
             Ok(())
         })?;
-        Ok(downloads)
-    }
-
-    /// [`Self::download`], waited for.
-    pub(super) fn read(
-        &self,
-        pseudo_gt: &PseudoGt,
-        views: &[TrainView],
-        kind: ImageKind,
-    ) -> Result<Vec<Vec<f32>>> {
-        self.download(pseudo_gt, views, kind)?.into_iter().map(Download::wait).collect()
+        downloads.into_iter().map(Download::wait).collect()
     }
 
     /// The target of a view, (3, H, W), in a new buffer or in the stored one.

@@ -91,8 +91,8 @@ const BUDGET: &[(&str, usize, &str)] = &[
     ("src/targets", 435, "Targets of views on the device, or of another program."),
     (
         "src/train",
-        9659,
-        "The trainer, its settings and their length; fall-off, lamps, skies; work ahead; kept lists; calls; growth.",
+        9603,
+        "The trainer, its settings and their length; fall-off, lamps, skies; kernels ahead; kept lists; calls; growth.",
     ),
     (
         "src",
