@@ -31,12 +31,13 @@ layout(push_constant, scalar) uniform Params {
     uvec2 size;  // pixels
     uint  in_channels;
     uint  out_channels;
+    uint  largest_index;  // in `shortcut_largest`
 };
 
 // Workgroups: (packed out channels / (M BLOCKS), columns / N, rows / (SUBGROUPS PACKED_ROWS)).
 layout(binding = 0) readonly  buffer WeightBound     { uint weight_bound[]; };
 layout(binding = 1) readonly  buffer SourceBound     { uint source_bound[]; };
-layout(binding = 2) readonly  buffer ShortcutLargest { uint shortcut_largest[]; };  // magnitude, as bits
+layout(binding = 2) readonly  buffer ShortcutLargest { uint shortcut_largest[]; };  // magnitudes, as bits
 layout(binding = 3) readonly  buffer ShortcutBound   { uint shortcut_bound[]; };
 layout(binding = 4) readonly  buffer Weights         { uvec4 weights[]; };   // (tap, out, in), eight halves each
 layout(binding = 5) readonly  buffer Source          { uvec4 source[]; };    // (rows, columns, in)
@@ -108,7 +109,7 @@ void main() {
     }
 
     precise float most = float(9 * in_channels) * uintBitsToFloat(weight_bound[0]) * uintBitsToFloat(source_bound[0]);
-    if (ACCUMULATE) most += uintBitsToFloat(shortcut_largest[0]);
+    if (ACCUMULATE) most += uintBitsToFloat(shortcut_largest[largest_index]);
     uint bound = floatBitsToUint(most);
     if (gl_WorkGroupID == uvec3(0) && gl_LocalInvocationIndex == 0) target_bound[0] = bound;
     float scale = packed_scale(packed_exponent(bound));

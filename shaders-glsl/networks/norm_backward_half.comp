@@ -9,7 +9,7 @@
 //! Neither mean exceeds the largest d, which bounds d_z. Reference: `src/reference/norm_backward_half.rs`.
 
 layout(binding = 4) readonly  buffer Sums         { vec2 sums[]; };     // (C,): of d_y and of d_y n
-layout(binding = 5) readonly  buffer Largest      { uint largest[]; };  // of d_f'
+layout(binding = 5) readonly  buffer Largest      { uint largest[]; };  // (uses,): of d_f'
 layout(binding = 6) readonly  buffer DTargetBound { uint d_target_bound[]; };
 layout(binding = 7) readonly  buffer DTarget      { uvec4 d_target[]; };  // d_f', packed
 layout(binding = 8) writeonly buffer DSourceBound { uint d_source_bound[]; };
@@ -22,7 +22,8 @@ void main() {
         float factor = values[offset + channel] * statistics[slot + channel].inverse_deviation;
         largest_factor = max(largest_factor, abs(factor));
     }
-    precise float most = subgroupMax(largest_factor) * (2.0 + most_normalised) * uintBitsToFloat(largest[0]);
+    precise float most = subgroupMax(largest_factor) * (2.0 + most_normalised);
+    most *= uintBitsToFloat(largest[slot / channel_count]);
     uint bound = floatBitsToUint(most);
     if (gl_WorkGroupID.xy == uvec2(0) && subgroupElect()) d_source_bound[0] = bound;
     float scale = packed_scale(packed_exponent(bound));

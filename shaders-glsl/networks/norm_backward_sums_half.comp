@@ -5,14 +5,14 @@
 #include "norm_channels.glsl"
 
 //! `norm_backward_sums` of packed maps: per chunk the sums of d_y and of d_y n; and the largest magnitude of d_f', as
-//! bits, into a word that was 0.
+//! bits, into the use's word, which was 0.
 //!
 //! Reference: `src/reference/norm_backward_sums_half.rs`.
 
 layout(binding = 4) readonly  buffer DTargetBound { uint d_target_bound[]; };
 layout(binding = 5) readonly  buffer DTarget  { uvec4 d_target[]; };  // d_f', packed
 layout(binding = 6) writeonly buffer Partials { vec2 partials[]; };   // (C, chunks)
-layout(binding = 7)           buffer Largest  { uint largest[]; };    // one
+layout(binding = 7)           buffer Largest  { uint largest[]; };    // (uses,)
 
 void main() {
     load_channels();
@@ -30,7 +30,7 @@ void main() {
         }
     }
     largest_seen = subgroupMax(largest_seen);
-    if (subgroupElect() && largest_seen > 0) atomicMax(largest[0], largest_seen);
+    if (subgroupElect() && largest_seen > 0) atomicMax(largest[slot / channel_count], largest_seen);
     [[unroll]] for (uint c = 0; c < 8; ++c) {
         vec2 sum = vec2(sum_of_pixels(sums[c].x), sum_of_pixels(sums[c].y));
         uint channel = 8 * EIGHT + c;

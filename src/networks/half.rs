@@ -252,12 +252,18 @@ impl HalfConv {
         target: &mut PackedMap,
     ) -> Result<()> {
         // The forward kernel binds something, and reads nothing of it.
-        let shortcut = shortcut.unwrap_or(ShortcutMap { largest: &source.bound, map: source });
+        let shortcut =
+            shortcut.unwrap_or(ShortcutMap { largest: &source.bound, index: 0, map: source });
         let (in_channels, out_channels) = (self.channels, self.channels);
         let (CooperativeMatrix { m, n, .. }, [subgroups, blocks]) = (self.matrix, self.shape);
         pass.dispatch(
             &self.products[way as usize],
-            &conv3x3_half::Params { size, in_channels, out_channels },
+            &conv3x3_half::Params {
+                size,
+                in_channels,
+                out_channels,
+                largest_index: shortcut.index,
+            },
             conv3x3_half::Buffers {
                 weight_bound: weights.bound.slice(),
                 source_bound: source.bound.slice(),
@@ -309,9 +315,10 @@ impl HalfConv {
     }
 }
 
-/// A map that a gradient is added to, and the bits of its largest magnitude.
+/// A map that a gradient is added to, and where the bits of its largest magnitude are.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ShortcutMap<'a> {
     pub(super) largest: &'a Buffer<u32>,
+    pub(super) index: u32,
     pub(super) map: &'a PackedMap,
 }

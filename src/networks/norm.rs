@@ -42,7 +42,7 @@ pub(super) struct NormMemory {
     pub(super) partials: Buffer<Vec2>,
     /// (C,)
     pub(super) sums: Buffer<Vec2>,
-    /// The largest magnitude of a packed gradient, as bits.
+    /// (uses,): the largest magnitude of a packed gradient, as bits.
     pub(super) largest: Buffer<u32>,
 }
 
@@ -223,12 +223,12 @@ impl NormMemory {
             statistics: gpu.uninit("norm_statistics", uses * channels)?,
             partials: gpu.uninit("norm_partials", channels * pixels.div_ceil(chunk as usize))?,
             sums: gpu.uninit("norm_sums", channels)?,
-            largest: gpu.uninit("norm_largest", 1)?,
+            largest: gpu.uninit("norm_largest", uses)?,
         })
     }
 
     /// Its size in floats.
     pub(super) fn floats(pixels: usize, channels: usize, uses: usize, chunk: u32) -> usize {
-        2 * channels * (uses + pixels.div_ceil(chunk as usize) + 1) + 1
+        2 * channels * (uses + pixels.div_ceil(chunk as usize) + 1) + uses
     }
 }

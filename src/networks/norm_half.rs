@@ -88,7 +88,7 @@ impl HalfNorm {
     }
 
     /// Writes dL/dz, with zeros around it, from z and dL/df', adds the gradients of gamma and beta, and leaves the
-    /// largest magnitude of dL/df' in `memory`.
+    /// largest magnitude of dL/df' in `memory`, whose word of this use was 0.
     #[expect(clippy::too_many_arguments, reason = "two maps in, two gradients out")]
     pub(super) fn backward(
         &self,
@@ -100,7 +100,6 @@ impl HalfNorm {
         [source, d_target]: [&PackedMap; 2],
         d_source: &mut PackedMap,
     ) -> Result<()> {
-        pass.fill(&mut memory.largest, 0);
         pass.dispatch(
             &self.backward_sums,
             &params!(self, of, norm_backward_sums_half),

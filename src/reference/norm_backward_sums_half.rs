@@ -30,7 +30,7 @@ impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let (d_target, sums) = sums(params, constants, &slices);
         write(sums, slices.partials);
-        let largest = &mut slices.largest[0];
+        let largest = &mut slices.largest[(params.slot / params.channel_count) as usize];
         *largest = d_target.iter().map(|d| d.abs().to_bits()).fold(*largest, u32::max);
     }
 

@@ -1,14 +1,14 @@
 //! `norm_forward` of packed maps, unpacked and packed again.
 
 use super::norm_forward;
-use super::packed::{self, unpacked};
-use super::rounding::Rounded;
+use super::packed::{PackedOutput, unpacked};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::norm_forward as planes;
 use crate::kernels::norm_forward_half::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// f' as planes.
-fn target(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Rounded> {
+/// f' .
+fn target(params: &Params, constants: &Constants, slices: &Slices<'_>) -> PackedOutput {
+    let bound = bound(params, slices);
     let &Params { size, channel_count, offset, slot, .. } = params;
     let source = unpacked(size, channel_count, slices.source, slices.source_bound[0]);
     let shortcut = unpacked(size, channel_count, slices.shortcut, slices.shortcut_bound[0]);
@@ -22,8 +22,8 @@ fn target(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Ro
         shortcut: &shortcut,
         target: &mut [],
     };
-    let [target] = norm_forward::target(&params, &constants, &slices);
-    target
+    let [planes] = norm_forward::target(&params, &constants, &slices);
+    PackedOutput { size, channels: channel_count, planes, bound, pixels_alone: false }
 }
 
 /// The bound of f', with the operations of the kernel.
@@ -37,18 +37,13 @@ fn bound(params: &Params, slices: &Slices<'_>) -> u32 {
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let (bound, target) = (bound(params, &slices), target(params, constants, &slices));
-        let target: Vec<f64> = target.into_iter().map(|it| it.value).collect();
-        slices.target_bound[0] = bound;
-        packed::write(params.size, params.channel_count, &target, bound, false, slices.target);
+        let written = target(params, constants, &slices);
+        slices.target_bound[0] = written.bound;
+        written.write(slices.target);
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let (bound, target) = (bound(params, &slices), target(params, constants, &slices));
-        let (size, channels, words) = (params.size, params.channel_count, 4 * slices.target.len());
-        Tolerances {
-            target_bound: Tolerance::Exact,
-            target: packed::tolerance(size, channels, &target, bound, words),
-        }
+        let target = target(params, constants, &slices).tolerance(slices.target.len());
+        Tolerances { target_bound: Tolerance::Exact, target }
     }
 }

@@ -1,13 +1,15 @@
 //! Feature maps, packed.
 
-use super::packed::write;
-use super::widen;
+use super::packed::PackedOutput;
+use super::rounding::Rounded;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::pack_map::{Constants, Kernel, Params, Slices, Tolerances};
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, Slices { bound, source, packed }: Slices<'_>) {
-        write(params.size, params.channels, &widen(source), bound[0], false, packed);
+        let &Params { size, channels } = params;
+        let planes = Rounded::all(source);
+        PackedOutput { size, channels, planes, bound: bound[0], pixels_alone: false }.write(packed);
     }
 
     /// The next half above or below.

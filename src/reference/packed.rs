@@ -82,39 +82,39 @@ fn for_each_half(
     }
 }
 
-/// Writes planes (C, H, W) as a packed map with this bound, and unless `pixels_alone` zeros around it.
-pub(super) fn write(
-    size: UVec2,
-    count: u32,
-    planes: &[f64],
-    bound: u32,
-    pixels_alone: bool,
-    packed: &mut [Eight],
-) {
-    let (scale, words) = (scale(bound), packed.as_flattened_mut());
-    for_each_half(size, count, pixels_alone, |half, value| {
-        let (word, shift) = (&mut words[half / 2], 16 * (half as u32 % 2));
-        let bits = nearest(value.map_or(0.0, |value| scale * planes[value]));
-        *word = *word & !(0xffff << shift) | bits << shift;
-    });
+/// A packed map that a kernel writes.
+pub(super) struct PackedOutput {
+    pub(super) size: UVec2,
+    pub(super) channels: u32,
+    /// Its numbers, (C, H, W).
+    pub(super) planes: Vec<Rounded>,
+    /// The bits of its bound.
+    pub(super) bound: u32,
+    /// Whether nothing around the map is written; else zeros.
+    pub(super) pixels_alone: bool,
 }
 
-/// The tolerance of a map that is written so: the error of its numbers, and that of the nearest halves above and below.
-pub(super) fn tolerance(
-    size: UVec2,
-    count: u32,
-    planes: &[Rounded],
-    bound: u32,
-    words: usize,
-) -> Tolerance {
-    let (scale, mut pairs) = (scale(bound), vec![[0.0; 2]; words]);
-    for_each_half(size, count, true, |half, value| {
-        pairs[half / 2][half % 2] = value.map_or(0.0, |value| {
-            let Rounded { value, error } = planes[value];
-            scale * error + (scale * value.abs() * f64::exp2(-10.0)).max(f64::exp2(-14.0))
+impl PackedOutput {
+    pub(super) fn write(&self, packed: &mut [Eight]) {
+        let (scale, words) = (scale(self.bound), packed.as_flattened_mut());
+        for_each_half(self.size, self.channels, self.pixels_alone, |half, value| {
+            let (word, shift) = (&mut words[half / 2], 16 * (half as u32 % 2));
+            let bits = nearest(value.map_or(0.0, |value| scale * self.planes[value].value));
+            *word = *word & !(0xffff << shift) | bits << shift;
         });
-    });
-    Tolerance::Packed { numbers: vec![], format: half, pairs }
+    }
+
+    /// The error of the numbers, and that of the nearest halves above and below, for this many eights.
+    pub(super) fn tolerance(&self, len: usize) -> Tolerance {
+        let (scale, mut pairs) = (scale(self.bound), vec![[0.0; 2]; 4 * len]);
+        for_each_half(self.size, self.channels, true, |half, value| {
+            pairs[half / 2][half % 2] = value.map_or(0.0, |value| {
+                let Rounded { value, error } = self.planes[value];
+                scale * error + (scale * value.abs() * f64::exp2(-10.0)).max(f64::exp2(-14.0))
+            });
+        });
+        Tolerance::Packed { numbers: vec![], format: half, pairs }
+    }
 }
 
 /// The values of a layer's packed weights, as (to, from, tap).

@@ -188,9 +188,9 @@ fn check_product(
             size.x.div_ceil(n),
             size.y.div_ceil(subgroups * PACKED_ROWS),
         ]);
-        let params = conv3x3_half::Params { size, in_channels, out_channels };
+        let params = conv3x3_half::Params { size, in_channels, out_channels, largest_index: 1 };
         let (target_bound, packed_target) = {
-            let (shortcut_largest, source) = (shortcut_bound.clone(), packed_source);
+            let (shortcut_largest, source) = (vec![0, shortcut_bound[0]], packed_source);
             let (target_bound, target) = (vec![0_u32], vec![UNWRITTEN; shortcut.len()]);
             run_kernel!(
                 conv3x3_half,
@@ -312,7 +312,7 @@ fn check_norm(size: UVec2, channel_count: u32, chunk: u32, mean: f32, deviation:
         [values, statistics, source_bound, source, shortcut_bound, shortcut],
         [target_bound, target]
     );
-    let largest = vec![0_u32];
+    let largest = vec![0_u32; 3];
     let (_, largest) = check!(
         norm_backward_sums_half,
         pixels,

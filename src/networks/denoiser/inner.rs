@@ -132,6 +132,7 @@ impl Inner {
                 let [before, after, d_convolved] = &mut gradients.packed;
                 let (mut d_target, mut d_source) = (before, after);
                 conv.pack_map(pass, size, d_features, d_target)?;
+                pass.fill(&mut memory.largest, 0);
                 let (way, weights) = (Direction::Backward, &stages[stage.number]);
                 for (repeat, convolved) in packed_convolved.iter().enumerate().rev() {
                     let (of, read) = (stage.norm(size, repeat), [convolved, &*d_target]);
@@ -139,7 +140,8 @@ impl Inner {
                     norm.backward(pass, of, stage.values, gradients, memory, read, d_convolved)?;
                     let factors = [&packed[repeat], &*d_convolved];
                     conv.weight_gradient(pass, size, stage.conv, factors, strips)?;
-                    let shortcut = Some(ShortcutMap { largest: &memory.largest, map: d_target });
+                    let (largest, index) = (&memory.largest, repeat as u32);
+                    let shortcut = Some(ShortcutMap { largest, index, map: d_target });
                     conv.product(pass, size, way, weights, d_convolved, shortcut, d_source)?;
                     std::mem::swap(&mut d_target, &mut d_source);
                 }
