@@ -7,7 +7,7 @@ use std::process::{Command, ExitStatus, Stdio};
 
 use nightsplat_core::output::write_whole;
 
-use crate::gpu::{DeviceChoice, DeviceReport, Gpu, SchedulerVariables, cache_folder, devices};
+use crate::gpu::{DeviceChoice, DeviceReport, Gpu, cache_folder};
 use crate::self_test::TEST_VARIABLE;
 use crate::{Error, Result};
 
@@ -17,23 +17,14 @@ const COMPILES: &str = "compiles";
 /// [`Gpu::new`], after a driver that is new on this machine was seen to compile every kernel.
 pub(crate) fn open(choice: &DeviceChoice) -> Result<Gpu> {
     let _phase = tracing::info_span!("device").entered();
-    check_new(choice)?;
-    Gpu::new(choice)
+    Gpu::open_checked(choice, check_new)?.tested()
 }
 
-/// Refuses a driver that is new on this machine and crashes when it compiles a kernel.
-pub(crate) fn check_new(choice: &DeviceChoice) -> Result<()> {
+/// Refuses a device whose driver is new on this machine and crashes when it compiles a kernel.
+fn check_new(device: &DeviceReport, index: usize) -> Result<()> {
     let wanted = std::env::var(TEST_VARIABLE).unwrap_or_default();
-    if wanted != "off" {
-        let devices = devices()?;
-        let index = SchedulerVariables::of_this_process().pick(choice, &devices)?.index;
-        let device = &devices[index];
-        let is_known = device.kind == "software" && wanted != "always";
-        if !is_known && device.missing().is_none() {
-            check(device, index)?;
-        }
-    }
-    Ok(())
+    let is_known = device.kind == "software" && wanted != "always";
+    if wanted == "off" || is_known { Ok(()) } else { check(device, index) }
 }
 
 fn check(device: &DeviceReport, index: usize) -> Result<()> {

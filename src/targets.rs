@@ -52,7 +52,9 @@ impl Targets {
     /// The target of a view, of its camera's size; `None` without a photograph.
     pub fn target(&self, view: &View) -> Result<Option<Image>> {
         let photograph = self.scene.source(view)?;
-        photograph.map(|photograph| self.target_of(view, &photograph)).transpose()
+        let target = photograph
+            .map(|photograph| self.target_of(view, &photograph, || view.measured(&photograph)));
+        target.transpose()
     }
 
     /// The target of a photograph with these measurements, of its own size.
@@ -64,12 +66,17 @@ impl Targets {
         self.pseudo_gt.tone_mapped(photograph, &self.scene.curve_of(measured))
     }
 
-    /// The target of a view with this photograph, of its camera's size.
-    pub(crate) fn target_of(&self, view: &View, photograph: &Image) -> Result<Image> {
+    /// The target of a view with this photograph and its measurements, of its camera's size.
+    pub(crate) fn target_of(
+        &self,
+        view: &View,
+        photograph: &Image,
+        measured: impl FnOnce() -> MeasuredPhotograph,
+    ) -> Result<Image> {
         let target = match self.external(view)? {
             Some(target) => target,
             None => {
-                let curve = self.scene.curve_of_image(view, photograph)?;
+                let curve = self.scene.curve_for(view, measured)?;
                 self.pseudo_gt.tone_mapped(photograph, &curve)?
             }
         };

@@ -115,7 +115,8 @@ float tabled(uint channel, float x) {
 // A table that begins at 0 or above is mirrored below 0.
 float signed_table(uint channel, float x) {
     bool is_mirrored = x < 0.0 && numbers[3 * channel * knot_count] >= 0.0;
-    return is_mirrored ? 2.0 * tabled(channel, 0.0) - tabled(channel, -x) : tabled(channel, x);
+    float y = tabled(channel, is_mirrored ? -x : x);
+    return is_mirrored ? 2.0 * tabled(channel, 0.0) - y : y;
 }
 
 float mix_of(uint begin, vec3 v) {
@@ -136,25 +137,29 @@ float profiled(uint channel, vec3 v, vec3 below) {
 }
 
 float signed_curve(float x, ToneParameters tone) {
-    return x < 0.0 ? 2.0 * tone_curve(0.0, tone) - tone_curve(-x, tone) : tone_curve(x, tone);
+    float y = tone_curve(x < 0.0 ? -x : x, tone);
+    return x < 0.0 ? 2.0 * tone_curve(0.0, tone) - y : y;
 }
 
 vec3 mapped(vec3 rgb, ToneParameters tone) {
+    vec3 y;
     switch (TONE_CURVE) {
     case CURVE_AUTO:
     case CURVE_LUM_PRESERVE:
     case CURVE_PER_CHANNEL:
         return mixed(rgb, tone);
     case CURVE_TABLE:
-        vec3 x = rgb / tone.white;
-        return vec3(signed_table(0, x.r), signed_table(1, x.g), signed_table(2, x.b));
+        [[unroll]] for (uint c = 0; c < 3; ++c) y[c] = signed_table(c, rgb[c] / tone.white);
+        return y;
     case CURVE_PROFILE:
         vec3 t = bounded(rgb, 65504.0) / tone.white;
         vec3 v = one_minus_exp(max(t, vec3(0.0)));
         vec3 below = one_minus_exp(max(-t, vec3(0.0)));
-        return vec3(profiled(0, v, below), profiled(1, v, below), profiled(2, v, below));
+        [[unroll]] for (uint c = 0; c < 3; ++c) y[c] = profiled(c, v, below);
+        return y;
     default:
-        return vec3(signed_curve(rgb.r, tone), signed_curve(rgb.g, tone), signed_curve(rgb.b, tone));
+        [[unroll]] for (uint c = 0; c < 3; ++c) y[c] = signed_curve(rgb[c], tone);
+        return y;
     }
 }
 

@@ -253,6 +253,18 @@ impl DeviceMemory {
         }
     }
 
+    /// Its bytes, for the host to write before a submission uses them, where that needs no more.
+    pub(super) fn coherent_mut(&mut self) -> Option<&mut [u8]> {
+        match self.allocation.as_mut()? {
+            Allocation::Ours(piece)
+                if piece.memory_properties().contains(vk::MemoryPropertyFlags::HOST_COHERENT) =>
+            {
+                piece.mapped_slice_mut()
+            }
+            _ => None,
+        }
+    }
+
     /// Its bytes, to write.
     pub(super) fn mapped_mut(&mut self) -> Option<&mut [u8]> {
         match self.allocation.as_mut()? {

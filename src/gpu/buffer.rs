@@ -70,6 +70,11 @@ impl<T: bytemuck::Pod> Buffer<T> {
         Ok(())
     }
 
+    /// Writes a new buffer, which no submission uses yet; returns whether the host sees its memory.
+    pub(super) fn write_from_host(&mut self, data: &[T]) -> bool {
+        self.memory.write(bytemuck::cast_slice(data))
+    }
+
     /// All of it, for copies of a buffer within the limit of a binding.
     pub(super) fn bound(&self) -> Bound {
         Bound { raw: self.memory.handle(), offset: 0, size: (self.len * size_of::<T>()) as u64 }

@@ -38,23 +38,36 @@ use crate::{Error, Result};
 impl Gpu {
     /// Opens a device that is still to be tested; see [`Gpu::new`].
     pub(crate) fn open(choice: &DeviceChoice) -> Result<Self> {
+        Self::open_checked(choice, |_, _| Ok(()))
+    }
+
+    /// [`Gpu::open`], if `check` passes the chosen device, which it gets with its index.
+    pub(crate) fn open_checked(
+        choice: &DeviceChoice,
+        check: impl FnOnce(&DeviceReport, usize) -> Result<()>,
+    ) -> Result<Self> {
         let validate = cfg!(debug_assertions) && validation_is_installed();
-        Self::open_with(choice, validate, true)
+        Self::open_with(choice, validate, true, check)
     }
 
     /// Opens a device that is still to be tested; see [`Gpu::with_validation`].
     pub(crate) fn open_validated(choice: &DeviceChoice) -> Result<Self> {
         if validation_is_installed() {
-            return Self::open_with(choice, true, false);
+            return Self::open_with(choice, true, false, |_, _| Ok(()));
         }
         let package = "on Debian `apt install vulkan-validationlayers`";
         Err(Error::NoDevice(format!("the Vulkan validation layer is not installed: {package}")))
     }
 
-    fn open_with(choice: &DeviceChoice, validate: bool, takes_tuning: bool) -> Result<Self> {
+    fn open_with(
+        choice: &DeviceChoice,
+        validate: bool,
+        takes_tuning: bool,
+        check: impl FnOnce(&DeviceReport, usize) -> Result<()>,
+    ) -> Result<Self> {
         address_space::check()?;
         let mut owned = instance(validate)?;
-        let opened = choose(&owned, choice).and_then(|(physical, supported)| {
+        let opened = choose(&owned, choice, check).and_then(|(physical, supported)| {
             owned.cache_path = cache_path(&supported);
             if takes_tuning {
                 let vk::PhysicalDeviceProperties { vendor_id, device_id, .. } =
@@ -366,8 +379,12 @@ fn timeline_and_cache(
 // ---------------------------------------------------------------------------
 // Physical device
 
-/// The physical device of a choice, with the variables of schedulers.
-fn choose(owned: &OwnedInstance, choice: &DeviceChoice) -> Result<(vk::PhysicalDevice, Supported)> {
+/// The physical device of a choice, with the variables of schedulers, if `check` passes it.
+fn choose(
+    owned: &OwnedInstance,
+    choice: &DeviceChoice,
+    check: impl FnOnce(&DeviceReport, usize) -> Result<()>,
+) -> Result<(vk::PhysicalDevice, Supported)> {
     let all = physical_devices(&owned.instance)?;
     let reports =
         all.iter().map(|&physical| report(owned, physical)).collect::<Result<Vec<_>>>()?;
@@ -382,6 +399,7 @@ fn choose(owned: &OwnedInstance, choice: &DeviceChoice) -> Result<(vk::PhysicalD
     }
     let supported = Supported::gather(&owned.instance, all[index]).map_err(loader_error)?;
     supported.check()?;
+    check(&reports[index], index)?;
     Ok((all[index], supported))
 }
 

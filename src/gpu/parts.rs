@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use ash::vk;
 use gpu_allocator::MemoryLocation;
+use rayon::prelude::*;
 
 use super::allocated::DeviceMemory;
 use super::{Bound, GpuShared};
@@ -55,6 +56,14 @@ impl Parts {
         self.part == u64::MAX || self.part.is_multiple_of(window.max(1))
     }
 
+    /// Writes the first bytes from the host, before a submission uses them; returns whether it sees the memory.
+    pub(super) fn write(&mut self, bytes: &[u8]) -> bool {
+        let part = usize::try_from(self.part).unwrap_or(usize::MAX);
+        self.parts.iter_mut().zip(bytes.chunks(part)).all(|(memory, bytes)| {
+            memory.coherent_mut().map(|memory| copy(bytes, &mut memory[..bytes.len()])).is_some()
+        })
+    }
+
     /// What to bind for `size` bytes from `first` on. Bytes of several parts have the size that no device binds.
     pub(super) fn bound(&self, first: u64, size: u64) -> Bound {
         let mut pieces = self.pieces(first, size);
@@ -75,4 +84,14 @@ impl Parts {
             Some(piece)
         })
     }
+}
+
+/// Copies to memory that may be new to the system, which takes longer to provide it than the copy.
+fn copy(from: &[u8], to: &mut [u8]) {
+    const OF_THREAD: usize = 1 << 18;
+    if from.len() <= OF_THREAD {
+        return to.copy_from_slice(from);
+    }
+    let pieces = to.par_chunks_mut(OF_THREAD).zip(from.par_chunks(OF_THREAD));
+    pieces.for_each(|(to, from)| to.copy_from_slice(from));
 }

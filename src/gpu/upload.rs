@@ -31,7 +31,9 @@ impl Gpu {
     /// As [`Gpu::zeros`].
     pub fn buffer<T: bytemuck::Pod>(&self, name: &str, data: &[T]) -> Result<Buffer<T>> {
         let mut buffer = self.uninit(name, data.len())?;
-        self.write(&mut buffer, data)?;
+        if !buffer.write_from_host(data) {
+            self.write(&mut buffer, data)?;
+        }
         Ok(buffer)
     }
 

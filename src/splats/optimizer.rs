@@ -11,6 +11,7 @@ pub use schedule::{LearningRates, Schedule};
 use std::sync::OnceLock;
 
 use nightsplat_models::attributes::PlaneCounts;
+use nightsplat_models::gaussians::Shape;
 
 use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Slice, SliceMut, Threads};
 use crate::kernels::sh::MAX_SH_DEGREE;
@@ -281,18 +282,7 @@ impl Adam {
         let words = layout.count * layout.words();
         check(step, status, [(parameters.as_slice(), words), (gradients, floats)], &moments)?;
         let stored = layout.shape.sh_degree;
-        let [half_rest, half_moments] =
-            [layout.sh_rest, moments.bits()].map(|format| format == StorageFormat::Half);
-        let constants = adam_gaussian::Constants {
-            sh_degree: stored,
-            feature_count: layout.shape.features.width() as u32,
-            half_rest,
-            half_moments,
-            rest_by_column: rest_by_column(&self.gpu),
-            frozen_columns,
-        };
-        let which = 4 * stored as usize + 2 * usize::from(half_rest) + usize::from(half_moments);
-        let pipeline = self.pipeline(&self.gaussians[which], &constants)?;
+        let pipeline = self.of_gaussians(layout.shape, [layout.sh_rest, moments.bits()])?;
         let [first_moments, second_moments, both_moments] = moments.bindings()?;
         let (uncorrected, second_correction) = corrections(step);
         pass.dispatch(
@@ -316,6 +306,25 @@ impl Adam {
             },
             Threads::Exactly([layout.count as u32, 1, 1]),
         )
+    }
+
+    /// The kernel for whole Gaussians of this shape with coefficients and moments of these formats.
+    pub(crate) fn of_gaussians(
+        &self,
+        Shape { sh_degree, features }: Shape,
+        formats: [StorageFormat; 2],
+    ) -> Result<&Pipeline<adam_gaussian::Kernel>> {
+        let [half_rest, half_moments] = formats.map(|format| format == StorageFormat::Half);
+        let constants = adam_gaussian::Constants {
+            sh_degree,
+            feature_count: features.width() as u32,
+            half_rest,
+            half_moments,
+            rest_by_column: rest_by_column(&self.gpu),
+            frozen_columns: self.frozen_columns,
+        };
+        let which = 4 * sh_degree as usize + 2 * usize::from(half_rest) + usize::from(half_moments);
+        self.pipeline(&self.gaussians[which], &constants)
     }
 
     fn pipeline<'a, K: Kernel>(

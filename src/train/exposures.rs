@@ -185,8 +185,8 @@ fn affine_of_stops(targets: &Targets, dataset: &Dataset, name: &str, stops: f64)
     let without = |&x: &f32| srgb_from_linear(scale * linear_from_srgb(x));
     let neutral =
         Image { data: photograph.data.iter().map(without).collect(), ..*photograph.as_ref() };
-    let neutral = targets.target_of(view, &neutral)?;
-    let affine = Affine::least_squares(&neutral, &targets.target_of(view, &photograph)?)?;
+    let target = |image: &Image| targets.target_of(view, image, || view.measured(image));
+    let affine = Affine::least_squares(&target(&neutral)?, &target(&photograph)?)?;
     // A photograph of one colour determines no affine.
     let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);
     Ok(if is_exposure { affine } else { Affine::IDENTITY })

@@ -17,6 +17,7 @@ use crate::loss::Losses;
 use crate::splats::batches::GradientKind;
 use crate::splats::densify::{Densifier, DensifySettings};
 use crate::splats::optimizer::{Adam, FiniteCheck};
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::{RenderSettings, Renderer};
 use crate::splats::smoothing::SmoothingFloor;
 use crate::targets::pseudo_gt::PseudoGt;
@@ -37,7 +38,7 @@ impl TrainKernels {
         Ok(Self {
             renderer: renderer(gpu, config)?,
             losses: Losses::new(gpu, &config.loss())?,
-            adam: Adam::with_frozen(gpu, config.frozen_columns())?,
+            adam: adam(gpu, config)?,
             finite: FiniteCheck::new(gpu)?,
             floor: floor(gpu, config, dataset)?,
             densifier: densifier(gpu, config, dataset)?,
@@ -73,7 +74,7 @@ fn compile(gpu: &Gpu, config: &TrainConfig) -> Result<()> {
     PseudoGt::new(gpu, &config.tone)?.compile()?;
     renderer(gpu, config)?;
     Losses::new(gpu, &config.loss())?.compile()?;
-    Adam::with_frozen(gpu, config.frozen_columns())?;
+    adam(gpu, config)?;
     FiniteCheck::new(gpu).map(drop)
 }
 
@@ -89,13 +90,30 @@ fn first_tile(gpu: &Gpu, config: &TrainConfig) -> Result<Tile> {
 
 fn renderer(gpu: &Gpu, config: &TrainConfig) -> Result<Renderer> {
     let (rest, settings) = (config.precision.rest, config.render_settings());
-    let shape = Shape { sh_degree: first_sh_degree(config), ..settings.shape };
     Renderer::with_gradients(
         gpu,
-        RenderSettings { rest, shape, ..settings },
-        GradientKind::on(gpu, [rest, config.precision.moments]),
+        RenderSettings { rest, shape: first_shape(config), ..settings },
+        GradientKind::on(gpu, formats(config)),
         config.frozen_columns(),
     )
+}
+
+fn adam(gpu: &Gpu, config: &TrainConfig) -> Result<Adam> {
+    let adam = Adam::with_frozen(gpu, config.frozen_columns())?;
+    if GradientKind::on(gpu, formats(config)) == GradientKind::Colors {
+        adam.of_gaussians(first_shape(config), formats(config))?;
+    }
+    Ok(adam)
+}
+
+/// The shape of the Gaussians in the first step.
+fn first_shape(config: &TrainConfig) -> Shape {
+    Shape { sh_degree: first_sh_degree(config), ..config.render_settings().shape }
+}
+
+/// Those of coefficients and moments.
+fn formats(config: &TrainConfig) -> [StorageFormat; 2] {
+    [config.precision.rest, config.precision.moments]
 }
 
 /// The smoothing floor of the training views, in the frame, if it is on.

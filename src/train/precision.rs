@@ -140,18 +140,41 @@ fn palette(values: &[f32], bits: PhotographBits) -> Option<Vec<u32>> {
 
 /// The bits of all different values, ascending; `None` if there are more than `most`.
 fn different(values: &[f32], most: usize) -> Option<Vec<u32>> {
+    if exceed(most, values) {
+        return None;
+    }
     let capacity = values.len().min(most + 1);
     let mut found = FxHashSet::with_capacity_and_hasher(capacity, FxBuildHasher);
-    let mut last = None;
-    for bits in values.iter().map(|value| value.to_bits()) {
-        // In dark photographs, neighbours are often equal.
-        if last.replace(bits) != Some(bits) && found.insert(bits) && found.len() > most {
+    for bits in changes(values) {
+        if found.insert(bits) && found.len() > most {
             return None;
         }
     }
     let mut different: Vec<u32> = found.into_iter().collect();
     different.sort_unstable();
     Some(different)
+}
+
+/// The bits of values that differ from the one before: in dark photographs, neighbours are often equal.
+fn changes(values: &[f32]) -> impl Iterator<Item = u32> {
+    let mut last = None;
+    values.iter().map(|x| x.to_bits()).filter(move |&bits| last.replace(bits) != Some(bits))
+}
+
+/// Whether more than `most` hashes differ, and so more than `most` values, which would take longer to collect.
+fn exceed(most: usize, values: &[f32]) -> bool {
+    const HASH_BITS: u32 = 20;
+    /// 2^32 over the golden ratio.
+    const SPREADING: u32 = 0x9e37_79b9;
+    let mut seen = vec![0_u64; 1 << HASH_BITS >> 6];
+    let mut different = 0;
+    changes(values).any(|bits| {
+        let hash = bits.wrapping_mul(SPREADING) >> (u32::BITS - HASH_BITS);
+        let (word, bit) = (&mut seen[hash as usize >> 6], 1 << (hash & 63));
+        different += usize::from(*word & bit == 0);
+        *word |= bit;
+        different > most
+    })
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use nightsplat_core::camera::{Camera, TrainingFrame};
 use nightsplat_photographs::dataset::{Dataset, View};
 use nightsplat_photographs::image::{Image, Mask};
 use nightsplat_photographs::metrics::{Scores, psnr_of_counted};
-use nightsplat_photographs::tone::{LuminanceHistogram, is_black};
+use nightsplat_photographs::tone::is_black;
 
 use super::call::{Call, Scored};
 use super::rendered::Rendered;
@@ -40,15 +40,15 @@ impl TargetViews {
         let mut shown = vec![];
         for view in views {
             let Some(photograph) = targets.scene.source(view)? else { continue };
-            let counted = view.counted(&photograph);
-            if counted.is_empty() || is_black(&LuminanceHistogram::new(&counted)) {
+            let measured = view.measured(&photograph);
+            if measured.luminance.pixel_count() == 0 || is_black(&measured.luminance) {
                 let name = &view.name;
                 tracing::warn!(
                     "view {name} is entirely black or masked: the model is not scored on it"
                 );
                 continue;
             }
-            let target = targets.target_of(view, &photograph)?;
+            let target = targets.target_of(view, &photograph, || measured)?;
             let (camera, mask) = (frame.camera(&view.camera), view.mask.clone());
             shown.push(TargetView { camera, target, mask, photograph: None });
         }

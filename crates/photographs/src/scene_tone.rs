@@ -187,13 +187,13 @@ impl SceneTone {
         Ok(measured.map(|measured| self.curve_of(&measured)))
     }
 
-    /// The curve of a view with this photograph.
-    pub fn curve_of_image(&self, view: &View, photograph: &Image) -> Result<ToneParameters> {
-        if self.is_recorded {
-            return self.known(view);
-        }
-        let measured = MeasuredPhotograph::measure(&view.counted(photograph)).seen_by(&view.camera);
-        Ok(self.curve_of(&measured))
+    /// The curve of a view with a photograph of these measurements, which a recorded law does not need.
+    pub fn curve_for(
+        &self,
+        view: &View,
+        measured: impl FnOnce() -> MeasuredPhotograph,
+    ) -> Result<ToneParameters> {
+        if self.is_recorded { self.known(view) } else { Ok(self.curve_of(&measured())) }
     }
 
     fn known(&self, View { name, .. }: &View) -> Result<ToneParameters> {
@@ -235,7 +235,7 @@ fn measured(views: &[&View], full_resolution: bool) -> Result<Vec<MeasuredPhotog
     let stage = Stage::begin("measuring photographs", views.len());
     let mut measured = vec![];
     for views in views.chunks(decoded_at_once(largest)) {
-        let of_views = views.par_iter().map(|view| {
+        let of_views = views.par_iter().with_max_len(1).map(|view| {
             stage.next()?;
             measured_of(view, full_resolution)
         });
@@ -248,12 +248,10 @@ fn measured(views: &[&View], full_resolution: bool) -> Result<Vec<MeasuredPhotog
 fn measured_of(view: &View, full_resolution: bool) -> Result<Option<MeasuredPhotograph>> {
     let size = if full_resolution { MeasuredSize::Own } else { MeasuredSize::Loaded };
     let read_anew = view.original.as_ref().filter(|_| full_resolution || view.image.is_none());
-    let measured = match read_anew.and_then(|original| original.measured(size)) {
-        Some(measured) => Some(measured.clone()),
-        None => source(view, full_resolution)?
-            .map(|photograph| MeasuredPhotograph::measure(&view.counted(&photograph))),
-    };
-    Ok(measured.map(|measured| measured.seen_by(&view.camera)))
+    Ok(match read_anew.and_then(|original| original.measured(size)) {
+        Some(measured) => Some(measured.clone().seen_by(&view.camera)),
+        None => source(view, full_resolution)?.map(|photograph| view.measured(&photograph)),
+    })
 }
 
 fn source(view: &View, full_resolution: bool) -> Result<Option<Cow<'_, Image>>> {

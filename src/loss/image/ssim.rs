@@ -56,7 +56,7 @@ struct SsimLayout {
 /// The first layout that fits a view is used; the last one fits every view.
 const LAYOUTS: [SsimLayout; 2] = [
     SsimLayout { columns: 12, rows: 192, alignment: 4 },
-    SsimLayout { columns: 10, rows: 192, alignment: 1 },
+    SsimLayout { columns: 6, rows: 192, alignment: 1 },
 ];
 
 /// The subgroups that occupy the largest GPUs: 24 on each of some 130 multiprocessors. With more, each would have fewer

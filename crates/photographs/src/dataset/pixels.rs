@@ -313,7 +313,8 @@ fn load_group(group: LensGroup, loading: &Loading<'_>) -> Result<Vec<LoadedView>
     let mut loaded = vec![];
     while !group.is_empty() {
         let now: Vec<_> = group.drain(..group.len().min(loading.at_once)).collect();
-        let now = now.into_par_iter().map(|source| {
+        // Each takes long: none waits in turn while a thread has nothing to do.
+        let now = now.into_par_iter().with_max_len(1).map(|source| {
             loading.stage.next()?;
             views.load(source)
         });

@@ -153,12 +153,17 @@ impl Taps {
     fn sample(&self, colors: &[Vec4], width: usize, first: usize) -> [f32; 3] {
         let mut sum = Vec4::ZERO;
         let [mut low, mut high] = [Vec4::INFINITY, Vec4::NEG_INFINITY];
-        for (row, down) in self.rows.iter().zip(self.down) {
-            let row = &colors[row * width - first..][..width];
+        let rows = self.rows.map(|row| &colors[row * width - first..][..width]);
+        for (row, down) in rows.into_iter().zip(self.down) {
             for (&column, across) in self.columns.iter().zip(self.across) {
-                let color = row[column];
-                sum += down * across * color;
-                // Not `min` and `max`, which treat a NaN as the processor does.
+                sum += down * across * row[column];
+                [low, high] = [row[column].min(low), row[column].max(high)];
+            }
+        }
+        // Processors differ in `min` and `max` of a NaN, which reaches the sum: the range is that of the others.
+        if sum.is_nan() {
+            [low, high] = [Vec4::INFINITY, Vec4::NEG_INFINITY];
+            for color in rows.iter().flat_map(|row| self.columns.map(|column| row[column])) {
                 low = Vec4::select(color.cmplt(low), color, low);
                 high = Vec4::select(color.cmpgt(high), color, high);
             }
@@ -292,6 +297,16 @@ mod tests {
         for x in (0..=40).map(|step| step as f32 / 10.0) {
             let [value, ..] = Taps::at([x, 2.0], 4, 4).sample(&plane, 4, 0);
             assert!((0.0..=1.0).contains(&value), "{x}: {value}");
+        }
+    }
+
+    #[test]
+    fn a_pixel_next_to_one_that_is_no_number_has_the_least_of_the_others() {
+        for at in 0..16 {
+            let mut plane = [0.25, 0.5, 0.75, 1.0].map(Vec4::splat).repeat(4);
+            plane[at] = Vec4::new(f32::NAN, plane[at].y, f32::INFINITY, 0.0);
+            let [nan, finite, _] = Taps::at([2.0, 2.0], 4, 4).sample(&plane, 4, 0);
+            assert_eq!((nan, finite), (0.25, 0.625), "{at}");
         }
     }
 }

@@ -8,6 +8,7 @@ use nightsplat_core::camera::Camera;
 
 use super::{NormalMap, Original};
 use crate::image::{Image, Mask, Orientation};
+use crate::tone::MeasuredPhotograph;
 
 /// A photograph's place in the dataset.
 #[derive(Clone, Debug)]
@@ -94,6 +95,12 @@ impl View {
             Some(mask) => mask.counted(image).into(),
             None => (&image.data).into(),
         }
+    }
+
+    /// The measurements of one of its images, of any size, without masked pixels.
+    #[doc(hidden)]
+    pub fn measured(&self, image: &Image) -> MeasuredPhotograph {
+        MeasuredPhotograph::measure(&self.counted(image)).seen_by(&self.camera)
     }
 
     /// One of its images, of any size, with masked pixels black.

@@ -108,8 +108,9 @@ pub fn percentiles<const N: usize>(values: &mut [f32], tenths: [usize; N]) -> [f
         // The rank q (n - 1) is split in integers: in f32 it is inexact beyond 2^24 values.
         let (rank, weight) = (tenths * last / 10, (tenths * last % 10) as f32 / 10.0);
         let rest = &mut values[from..];
-        let (_, &mut lower, above) = rest.select_nth_unstable_by(rank - from, f32::total_cmp);
-        let upper = above.iter().copied().min_by(f32::total_cmp).unwrap_or(lower);
+        // The bits of such floats sort like their values.
+        let (_, &mut lower, above) = rest.select_nth_unstable_by_key(rank - from, |x| x.to_bits());
+        let upper = above.iter().map(|x| x.to_bits()).min().map_or(lower, f32::from_bits);
         from = rank;
         lower + weight * (upper - lower)
     })
