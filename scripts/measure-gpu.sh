@@ -338,7 +338,7 @@ tune() {
     local name=$1 limit=$2
     shift 2
     step "$name" "$name.json" "$limit" "$nightsplat" bench --tune --json --repeats "$REPEATS" "$@" || return
-    note "$(sed -n '/^  "tiles": \[/,/^  \]/p' "$found/$name.json" | tr -d ' \n')"
+    note "$(sed -n '/^  "tiles": \[/,/^  \]/p; /^  "ssim_strips"/p' "$found/$name.json" | tr -d ' \n')"
 }
 
 # Every tile with both sorts; then steps with what was faster.

@@ -5,6 +5,7 @@ mod ceilings;
 pub mod scene;
 mod stages;
 mod steady;
+mod strips;
 pub(crate) mod tiles;
 
 use std::collections::{BTreeMap, BTreeSet};

@@ -87,7 +87,7 @@ pub use statistics::{Resources, Statistic};
 pub use subgroups::SUBGROUP_VARIABLE;
 pub use submission::{PassTime, Submission};
 pub use supported::PUSH_VARIABLE;
-pub use tuning::{BackwardForm, RecordSums, Sorting, TUNE_VARIABLE, Tile, TunedTile};
+pub use tuning::{BackwardForm, RecordSums, Sorting, TUNE_VARIABLE, Tile, TunedTile, Tuning};
 
 use crate::{Error, Result};
 
@@ -177,8 +177,8 @@ struct GpuShared {
     checks: checked::Checks,
     pipeline_cache: vk::PipelineCache,
     pipelines: Mutex<pipeline::CompiledKernels>,
-    /// The file of the fastest tiles, read on first use.
-    tuned_tiles: OnceLock<Vec<TunedTile>>,
+    /// The file of what is fastest, read on first use.
+    tuning: OnceLock<Tuning>,
     /// What we created around the device and destroy with it; `None` for a borrowed device.
     owned: Option<instance::OwnedInstance>,
 }

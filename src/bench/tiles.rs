@@ -1,4 +1,4 @@
-//! Times the rasteriser with every tile size that the device supports, and stores the fastest.
+//! Times the rasteriser with every tile size that the device supports, and SSIM in strips; stores what is fastest.
 
 use std::path::PathBuf;
 
@@ -9,10 +9,11 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use super::scene::BenchScene;
+use super::strips::{self, StripTimings};
 use super::{Bench, median, stages, total};
 use crate::Result;
 use crate::gpu::{
-    BackwardForm, Buffer, Properties, RecordSums, Resources, Sorting, Tile, TunedTile,
+    BackwardForm, Buffer, Properties, RecordSums, Resources, Sorting, Tile, TunedTile, Tuning,
 };
 use crate::splats::batches::GradientKind;
 use crate::splats::device::{DeviceGaussians, Layout, Upload};
@@ -62,20 +63,22 @@ struct TileTiming {
     resources: Option<[Resources; 2]>,
 }
 
-/// Every tile at every size and number of channels, and the fastest.
-pub(crate) struct TileTimings {
+/// Every tile at every size and number of channels, strips at every size, and the fastest.
+pub(crate) struct TuningTimings {
     cases: Vec<Case>,
-    /// The fastest tile for each number of channels.
-    pub(crate) fastest: Vec<TunedTile>,
+    /// Those of a GPU.
+    strips: Vec<StripTimings>,
+    /// The fastest of both.
+    pub(crate) fastest: Tuning,
     /// The file that has them; `None` where tuning is off.
     pub(crate) file: Option<PathBuf>,
 }
 
-impl TileTimings {
-    /// Measures every case, and stores the fastest tiles.
+impl TuningTimings {
+    /// Measures every case, and stores what is fastest.
     pub(crate) fn measure(bench: &Bench, sizes: &[[u32; 2]]) -> Result<Self> {
         let device = bench.gpu.properties();
-        let (mut cases, mut fastest) = (vec![], vec![]);
+        let (mut cases, mut tiles) = (vec![], vec![]);
         for features in FEATURES {
             let measured = |choices: &[(Tile, Sorting)]| {
                 let sizes = sizes.iter().filter(|_| !choices.is_empty());
@@ -88,11 +91,16 @@ impl TileTimings {
             let Some(choice) = fastest_of(&of_tiles) else { continue };
             let of_forms = measured(&in_forms(device, choice))?;
             let (tile, sorting) = fastest_of(&of_forms).unwrap_or(choice);
-            fastest.push(TunedTile { channels: features.channels(), tile, sorting });
+            tiles.push(TunedTile { channels: features.channels(), tile, sorting });
             cases.extend(of_tiles.into_iter().chain(of_forms));
         }
-        let file = bench.gpu.keep_tuned_tiles(&fastest)?;
-        Ok(Self { cases, fastest, file })
+        // A processor has another kernel.
+        let of_strips = sizes.iter().filter(|_| !device.is_cpu);
+        let strips = of_strips.map(|&size| StripTimings::measure(bench, size));
+        let strips = strips.collect::<Result<Vec<_>>>()?;
+        let fastest = Tuning { tiles, ssim_strips: strips::fastest_of(&strips) };
+        let file = bench.gpu.keep_tuning(&fastest)?;
+        Ok(Self { cases, strips, fastest, file })
     }
 
     pub(crate) fn as_json(&self, bench: &Bench) -> Value {
@@ -104,14 +112,16 @@ impl TileTimings {
             "scene": bench.source.name(),
             "repeats": bench.repeats,
             "cases": self.cases.iter().map(Case::as_json).collect::<Vec<_>>(),
-            "tiles": self.fastest,
+            "ssim": self.strips.iter().map(StripTimings::as_json).collect::<Vec<_>>(),
+            "tiles": self.fastest.tiles,
+            "ssim_strips": self.fastest.ssim_strips,
             "file": self.file,
         })
     }
 
-    /// A table for each case.
+    /// A table for each case, and for the strips of each size.
     pub(crate) fn tables(&self) -> impl Iterator<Item = String> {
-        self.cases.iter().map(Case::as_text)
+        self.cases.iter().map(Case::as_text).chain(self.strips.iter().map(StripTimings::as_text))
     }
 }
 

@@ -8,7 +8,7 @@ use nightsplat_models::gaussians::Features;
 
 use super::{finish, print};
 use crate::Error;
-use crate::bench::tiles::TileTimings;
+use crate::bench::tiles::TuningTimings;
 use crate::bench::{Bench, BenchOptions, Findings, Source};
 use crate::driver;
 use crate::gpu::{DeviceChoice, TUNE_VARIABLE, TunedTile};
@@ -27,7 +27,7 @@ pub struct BenchArgs {
     /// Print JSON instead of tables
     #[arg(long)]
     pub json: bool,
-    /// Find the fastest tile sizes of the device, and store them for training
+    /// Find the fastest tile sizes of the device, and strips for SSIM, and store them for training
     #[arg(long)]
     pub tune: bool,
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the best]
@@ -120,9 +120,9 @@ pub fn run(args: &BenchArgs) -> Result<()> {
     Ok(findings.checked.agree()?)
 }
 
-/// Times every tile, and prints.
+/// Times every tile and strips, and prints.
 fn tune(bench: &Bench, sizes: &[[u32; 2]], as_json: bool) -> Result<()> {
-    let tuning = TileTimings::measure(bench, sizes)?;
+    let tuning = TuningTimings::measure(bench, sizes)?;
     if as_json {
         return Ok(print(format_args!("{:#}", tuning.as_json(bench)))?);
     }
@@ -135,7 +135,8 @@ fn tune(bench: &Bench, sizes: &[[u32; 2]], as_json: bool) -> Result<()> {
     let tile = |TunedTile { channels, tile, sorting }: &TunedTile| {
         format!("{tile} at {channels} channels, {sorting}")
     };
-    let fastest = tuning.fastest.iter().map(tile).collect::<Vec<_>>().join(", ");
+    let strips = tuning.fastest.ssim_strips.map(|strips| format!("{strips} strips for SSIM"));
+    let fastest = tuning.fastest.tiles.iter().map(tile).chain(strips).collect::<Vec<_>>().join(", ");
     match &tuning.file {
         Some(_) => print(format_args!("fastest: {fastest}"))?,
         None => print(format_args!("fastest: {fastest}; not stored, as {TUNE_VARIABLE} is off"))?,

@@ -171,7 +171,7 @@ impl Gpu {
                 labels: debug.clone().filter(|_| has_labels),
                 debug,
                 executables,
-                tuned_tiles: OnceLock::new(),
+                tuning: OnceLock::new(),
                 device,
                 memory: Mutex::new(Some(memory)),
                 callbacks,

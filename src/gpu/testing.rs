@@ -8,7 +8,7 @@ use ash::vk;
 pub use nightsplat_core::testing::not_run;
 
 pub use super::faults::Faults;
-use super::{DeviceChoice, Gpu, GpuShared, Interface, Properties, Sorting, TunedTile};
+use super::{DeviceChoice, Gpu, GpuShared, Interface, Properties, Sorting, TunedTile, Tuning};
 
 static GPU: OnceLock<Gpu> = OnceLock::new();
 
@@ -48,7 +48,8 @@ pub fn gpu_with(adapt: impl FnOnce(&mut Properties)) -> Gpu {
     open(|shared| adapt(&mut shared.properties))
 }
 
-/// Another device with validation, a GPU by its properties, where a sort of each tile was measured to be the fastest.
+/// Another device with validation, a GPU by its properties, where a sort of each tile, and 1536 strips for SSIM, were
+/// measured to be the fastest.
 ///
 /// # Panics
 /// As [`gpu`].
@@ -56,7 +57,8 @@ pub fn gpu_that_sorts_tiles() -> Gpu {
     open(|shared| {
         shared.properties.is_cpu = false;
         let tile = TunedTile { channels: 3, tile: [16, 16].into(), sorting: Sorting::Tiles };
-        shared.tuned_tiles = OnceLock::from(vec![tile]);
+        let ssim_strips = NonZeroU32::new(1536);
+        shared.tuning = OnceLock::from(Tuning { tiles: vec![tile], ssim_strips });
     })
 }
 

@@ -1,7 +1,7 @@
-//! The fastest tile sizes of this device, measured by `nightsplat bench --tune`: a small file in the user's cache
-//! folder.
+//! What is fastest on this device, measured by `nightsplat bench --tune`: a small file in the user's cache folder.
 
 use std::fmt;
+use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 
 use nightsplat_core::output::write_whole;
@@ -149,13 +149,24 @@ pub struct TunedTile {
     pub sorting: Sorting,
 }
 
+/// What is fastest on a device.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Tuning {
+    /// A tile for each number of channels.
+    pub tiles: Vec<TunedTile>,
+    /// The number of strips that a view is divided into for SSIM, as far as the limits of their rows allow.
+    pub ssim_strips: Option<NonZeroU32>,
+}
+
 /// The measurements, with device and driver.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Tuning {
+struct TuningFile {
     device: String,
     driver: String,
     tiles: Vec<TunedTile>,
+    #[serde(default)]
+    ssim_strips: Option<NonZeroU32>,
 }
 
 impl Properties {
@@ -189,23 +200,34 @@ impl Properties {
 }
 
 impl Gpu {
-    /// The tile that was fastest on this device and driver for the nearest number of channels; `None` without
-    /// measurements, or where the device is lent or opened for validation.
+    /// What was fastest on this device and driver; nothing without measurements, or where the device is lent or opened
+    /// for validation.
+    fn tuning(&self) -> &Tuning {
+        let measured =
+            || self.tuning_path().map_or_else(Tuning::default, |path| load(path, self.properties()));
+        self.shared.tuning.get_or_init(measured)
+    }
+
+    /// The tile that was fastest for the nearest number of channels.
     pub(crate) fn tuned_tile(&self, channels: usize) -> Option<TunedTile> {
-        let measured = || self.tuning_path().map_or(vec![], |path| load(path, self.properties()));
-        let tiles = self.shared.tuned_tiles.get_or_init(measured);
         let far = |tuned: &&TunedTile| tuned.channels.abs_diff(channels);
-        tiles.iter().min_by_key(far).copied()
+        self.tuning().tiles.iter().min_by_key(far).copied()
+    }
+
+    /// See [`Tuning::ssim_strips`].
+    pub(crate) fn tuned_ssim_strips(&self) -> Option<NonZeroU32> {
+        self.tuning().ssim_strips
     }
 
     /// Saves the measurements for later runs; returns the file, or `None` where there is none.
-    pub(crate) fn keep_tuned_tiles(&self, tiles: &[TunedTile]) -> Result<Option<PathBuf>> {
+    pub(crate) fn keep_tuning(&self, tuning: &Tuning) -> Result<Option<PathBuf>> {
         let Some(path) = self.tuning_path() else { return Ok(None) };
         let Properties { name, driver, .. } = self.properties();
-        let tuning = Tuning { device: name.clone(), driver: driver.clone(), tiles: tiles.to_vec() };
+        let Tuning { tiles, ssim_strips } = tuning.clone();
+        let file = TuningFile { device: name.clone(), driver: driver.clone(), tiles, ssim_strips };
         let folder = path.parent().map_or(Ok(()), std::fs::create_dir_all);
         folder.map_err(|error| Error::output(path, format!("cannot be created ({error})")))?;
-        write_whole(path, format!("{:#}\n", serde_json::json!(tuning)).as_bytes())?;
+        write_whole(path, format!("{:#}\n", serde_json::json!(file)).as_bytes())?;
         Ok(Some(path.to_owned()))
     }
 
@@ -223,23 +245,23 @@ pub(super) fn path(cache: Option<PathBuf>, vendor: u32, device: u32) -> Option<P
     }
 }
 
-/// The tiles in the file; empty, with a line in the log, where they are not of this device.
-fn load(path: &Path, properties: &Properties) -> Vec<TunedTile> {
-    let tiles = match std::fs::read(path) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return vec![],
+/// What the file says; nothing, with a line in the log, where that is not of this device.
+fn load(path: &Path, properties: &Properties) -> Tuning {
+    let tuning = match std::fs::read(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Tuning::default(),
         Err(error) => Err(format!("cannot be read ({error})")),
-        Ok(bytes) => tiles(&bytes, properties),
+        Ok(bytes) => parsed(&bytes, properties),
     };
-    tiles.unwrap_or_else(|problem| {
+    tuning.unwrap_or_else(|problem| {
         let remedy = "`nightsplat bench --tune` measures again";
         tracing::warn!("{}: {problem}; it is ignored: {remedy}", path.display());
-        vec![]
+        Tuning::default()
     })
 }
 
-fn tiles(bytes: &[u8], properties: &Properties) -> Result<Vec<TunedTile>, String> {
+fn parsed(bytes: &[u8], properties: &Properties) -> Result<Tuning, String> {
     let damaged = |problem: String| format!("is damaged ({problem})");
-    let Tuning { device, driver, tiles } =
+    let TuningFile { device, driver, tiles, ssim_strips } =
         serde_json::from_slice(bytes).map_err(|error| damaged(error.to_string()))?;
     let Properties { name, driver: this_driver, subgroup_size, .. } = properties;
     if (&device, &driver) != (name, this_driver) {
@@ -249,7 +271,7 @@ fn tiles(bytes: &[u8], properties: &Properties) -> Result<Vec<TunedTile>, String
     unsuitable.map_or(Ok(()), |TunedTile { tile, .. }| {
         Err(damaged(format!("{tile} tiles do not suit {subgroup_size} lanes")))
     })?;
-    Ok(tiles)
+    Ok(Tuning { tiles, ssim_strips })
 }
 
 #[cfg(test)]
@@ -351,17 +373,20 @@ mod tests {
 
     #[test]
     fn only_an_intact_file_of_this_device_and_driver_is_used() {
-        let text = |device: &str, driver: &str, tile: [u32; 2]| {
+        let tuning = |tile: [u32; 2]| {
             let tiles = vec![TunedTile { channels: 3, tile: tile.into(), sorting: Sorting::Tiles }];
-            let tuning = Tuning { device: device.to_owned(), driver: driver.to_owned(), tiles };
-            serde_json::json!(tuning).to_string()
+            Tuning { tiles, ssim_strips: NonZeroU32::new(1536) }
         };
-        let read = |text: &str| tiles(text.as_bytes(), &properties());
+        let text = |device: &str, driver: &str, tile| {
+            let Tuning { tiles, ssim_strips } = tuning(tile);
+            let (device, driver) = (device.to_owned(), driver.to_owned());
+            serde_json::json!(TuningFile { device, driver, tiles, ssim_strips }).to_string()
+        };
+        let read = |text: &str| parsed(text.as_bytes(), &properties());
         let whole = text("Abacus 3000", "beads 1.0", [16, 4]);
-        assert_eq!(
-            read(&whole).unwrap(),
-            [TunedTile { channels: 3, tile: [16, 4].into(), sorting: Sorting::Tiles }]
-        );
+        assert_eq!(read(&whole).unwrap(), tuning([16, 4]));
+        let older = whole.replace(r#""ssim_strips":1536,"#, "");
+        assert_eq!(read(&older).unwrap(), Tuning { ssim_strips: None, ..tuning([16, 4]) });
         let refused = |text: &str, part: &str| {
             let problem = read(text).unwrap_err();
             assert!(problem.contains(part) && !problem.contains('\n'), "{problem}");
@@ -369,6 +394,7 @@ mod tests {
         refused(&text("Abacus 2000", "beads 1.0", [16, 4]), "measured on Abacus 2000, beads 1.0");
         refused(&text("Abacus 3000", "beads 0.9", [16, 4]), "this is Abacus 3000, beads 1.0");
         refused(&text("Abacus 3000", "beads 1.0", [5, 5]), "5x5 tiles do not suit 8 lanes");
+        refused(&whole.replace("1536", "0"), "damaged");
         refused(&whole[..whole.len() / 2], "damaged");
         refused("", "damaged");
     }

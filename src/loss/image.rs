@@ -6,6 +6,8 @@
 
 mod ssim;
 
+use std::num::NonZeroU32;
+
 use glam::UVec2;
 
 use ssim::SsimLoss;
@@ -113,6 +115,15 @@ impl Loss {
             l1_partials: gpu.uninit("l1_partials", 0)?,
             ssim_partials: gpu.uninit("ssim_partials", 0)?,
         })
+    }
+
+    /// Divides views into about this number of strips for SSIM, where the device is a GPU. Gradients do not depend on
+    /// it, the last bits of the logged means do.
+    #[doc(hidden)]
+    pub fn set_ssim_strips(&mut self, count: NonZeroU32) {
+        if let ImageKernels::Ssim(ssim) = &mut self.kernels {
+            ssim.set_strips(count);
+        }
     }
 
     /// Allocates scratch memory for views up to `size`; it never shrinks.

@@ -106,6 +106,36 @@ fn check_ssim(shape: [u32; 3], size: [u32; 2], loss_region: LossRegion) -> Vec<f
     .0
 }
 
+/// The strips of a view are a matter of speed.
+#[test]
+fn no_bit_of_the_gradient_depends_on_the_number_of_strips() {
+    let gpu = gpu_with(|properties| properties.is_cpu = false);
+    let size = UVec2::new(61, 333);
+    let [render, target] = images(size.to_array()).map(|image| gpu.buffer("image", &image).unwrap());
+    let evaluate = |strips: u32| {
+        let mut loss = loss(&gpu, 0.2).unwrap();
+        loss.set_ssim_strips(strips.try_into().unwrap());
+        loss.reserve(size).unwrap();
+        let mut d_render = gpu.uninit("d_render", render.len()).unwrap();
+        let logged = log_step(&gpu, |pass, log| {
+            let (loss_region, [render, target]) = (LossRegion::whole(size), [&render, &target]);
+            let inputs = LossInputs { size, loss_region, render, target };
+            loss.record(pass, inputs, &mut d_render, log)
+        });
+        let losses = logged.unwrap().losses;
+        let means = [Term::L1, Term::SSIM].map(|term| f64::from(losses.get(term)));
+        (gpu.read(&d_render).unwrap(), means)
+    };
+    let (d_render, means) = evaluate(6144);
+    for strips in [1, 100, 700] {
+        let (other, others) = evaluate(strips);
+        assert_eq!(bits(&other), bits(&d_render), "{strips} strips");
+        for (other, mean) in others.into_iter().zip(means) {
+            assert!((other / mean - 1.0).abs() < 1e-5, "{strips} strips: {other} and {mean}");
+        }
+    }
+}
+
 #[test]
 fn the_kernel_of_ssim_matches_its_reference_at_every_size() {
     for size in SIZES {

@@ -1,5 +1,7 @@
 //! The kernels of SSIM: one on a CPU, two on a GPU.
 
+use std::num::NonZeroU32;
+
 use glam::UVec2;
 
 use super::super::Term;
@@ -25,6 +27,8 @@ pub(super) struct SsimLoss {
 enum SsimKernels {
     One(StripKernels),
     Two {
+        /// The strips of a view, as far as the limits of their rows allow.
+        strips: u32,
         forward: Pipeline<ssim_forward::Kernel>,
         backward: Pipeline<ssim_backward::Kernel>,
         /// (3, H, W) each: the derivatives with respect to E\[a\], E\[aa\] and E\[ab\].
@@ -59,10 +63,11 @@ const LAYOUTS: [SsimLayout; 2] = [
     SsimLayout { columns: 6, rows: 192, alignment: 1 },
 ];
 
-/// The subgroups that occupy the largest GPUs: 24 on each of some 130 multiprocessors. With more, each would have fewer
-/// rows, and the rows above and below that it loads would be a larger share.
-const SUBGROUPS: u64 = 3072;
-/// The fewest and the most rows of a subgroup.
+/// The strips that occupy the largest GPUs where `bench --tune` did not find a number: 24 on each of some 130
+/// multiprocessors. With more, each would have fewer rows, and the rows above and below that it loads would be a larger
+/// share.
+const STRIPS: u32 = 3072;
+/// The fewest and the most rows of a strip.
 const ROWS: [u64; 2] = [8, 128];
 
 impl SsimLayout {
@@ -78,10 +83,10 @@ impl SsimLayout {
     }
 }
 
-/// The rows of a subgroup of a GPU.
-fn rows(size: UVec2, lanes: u32) -> u32 {
+/// The rows of a strip, one column of pixels a lane, for about this number of strips.
+fn rows(size: UVec2, lanes: u32, strips: u32) -> u32 {
     let columns = u64::from(3 * size.x.div_ceil(lanes));
-    (columns * u64::from(size.y) / SUBGROUPS).clamp(ROWS[0], ROWS[1]) as u32
+    (columns * u64::from(size.y) / u64::from(strips)).clamp(ROWS[0], ROWS[1]) as u32
 }
 
 fn layout_of(size: UVec2) -> usize {
@@ -109,6 +114,7 @@ impl SsimLoss {
                 SsimKernels::One(StripKernels { gpu: gpu.clone(), adds, compiled: [None, None] })
             }
             false => SsimKernels::Two {
+                strips: gpu.tuned_ssim_strips().map_or(STRIPS, NonZeroU32::get),
                 forward: gpu.pipeline(&ssim_forward::Constants::default())?,
                 backward: gpu.pipeline(&ssim_backward::Constants { adds })?,
                 derivatives: [
@@ -120,6 +126,13 @@ impl SsimLoss {
             },
         };
         Ok(Self { weight, lanes: gpu.properties().subgroup_size, kernels })
+    }
+
+    /// Divides views into about this number of strips on a GPU.
+    pub(super) fn set_strips(&mut self, count: NonZeroU32) {
+        if let SsimKernels::Two { strips, .. } = &mut self.kernels {
+            *strips = count.get();
+        }
     }
 
     /// Compiles the kernels of views of any size.
@@ -147,8 +160,8 @@ impl SsimLoss {
     pub(super) fn workgroups(&self, size: UVec2) -> u32 {
         3 * match &self.kernels {
             SsimKernels::One(_) => LAYOUTS[layout_of(size)].subgroups(size, self.lanes),
-            SsimKernels::Two { .. } => {
-                size.x.div_ceil(self.lanes) * size.y.div_ceil(rows(size, self.lanes))
+            SsimKernels::Two { strips, .. } => {
+                size.x.div_ceil(self.lanes) * size.y.div_ceil(rows(size, self.lanes, *strips))
             }
         }
     }
@@ -163,14 +176,14 @@ impl SsimLoss {
         terms: [Term; 2],
         log: &mut LogSlot<'_>,
     ) -> Result<bool> {
-        let strips = self.workgroups(size);
-        let threads = Threads::Workgroups([strips, 1, 1]);
+        let workgroups = self.workgroups(size);
+        let threads = Threads::Workgroups([workgroups, 1, 1]);
         let mean_scale = 1.0 / f64::from(loss_region.value_count());
         let l1_scale = ((1.0 - self.weight) * mean_scale) as f32;
         let ssim_scale = (self.weight * mean_scale) as f32;
-        let (UVec2 { x: width, y: height }, rows) = (size, rows(size, self.lanes));
+        let UVec2 { x: width, y: height } = size;
         let (loss_begin, loss_end) = (loss_region.origin, loss_region.end());
-        let (forward, backward, [d_mean, d_square, d_product], arrivals) = match &mut self.kernels {
+        let (strips, forward, backward, derivatives, arrivals) = match &mut self.kernels {
             SsimKernels::One(kernels) => {
                 pass.dispatch(
                     kernels.kernel(layout_of(size))?,
@@ -186,10 +199,12 @@ impl SsimLoss {
                 )?;
                 return Ok(false);
             }
-            SsimKernels::Two { forward, backward, derivatives, arrivals } => {
-                (forward, backward, derivatives, arrivals)
+            SsimKernels::Two { strips, forward, backward, derivatives, arrivals } => {
+                (*strips, forward, backward, derivatives, arrivals)
             }
         };
+        let rows = rows(size, self.lanes, strips);
+        let [d_mean, d_square, d_product] = derivatives;
         pass.dispatch(
             forward,
             &ssim_forward::Params { width, height, rows, loss_begin, loss_end },
@@ -215,7 +230,7 @@ impl SsimLoss {
                 l1_scale,
                 ssim_scale,
                 mean_scale: mean_scale as f32,
-                strips,
+                strips: workgroups,
                 slot,
                 term_count,
                 terms: terms.map(|term| term.index() as u32).into(),
@@ -243,13 +258,30 @@ impl SsimLoss {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu::testing::{gpu_that_sorts_tiles, gpu_with};
+
+    #[test]
+    fn a_gpu_divides_views_into_the_strips_that_were_found_fastest() {
+        let workgroups = |gpu: &Gpu| {
+            let loss = SsimLoss::new(gpu, 0.2, false).unwrap();
+            // Columns of strips, with rows for the kernel.
+            let [size, lanes] = [UVec2::new(64, 1200), UVec2::splat(loss.lanes)];
+            loss.workgroups(size) / (3 * size.x.div_ceil(lanes.x))
+        };
+        let columns = 3 * 64 / gpu_with(|_| ()).properties().subgroup_size;
+        let expected = |strips: u32| 1200_u32.div_ceil((columns * 1200 / strips).clamp(8, 128));
+        assert_eq!(workgroups(&gpu_that_sorts_tiles()), expected(1536));
+        assert_eq!(workgroups(&gpu_with(|gpu| gpu.is_cpu = false)), expected(STRIPS));
+        assert_ne!(expected(1536), expected(STRIPS));
+    }
 
     #[test]
     fn a_larger_view_has_longer_strips_on_a_gpu() {
-        let rows = |width, height| rows(UVec2::new(width, height), 32);
-        assert_eq!(
-            [rows(1, 1), rows(500, 375), rows(1920, 1080), rows(8000, 6000)],
-            [8, 8, 63, 128]
-        );
+        let rows = |width, height, strips| rows(UVec2::new(width, height), 32, strips);
+        let by_default = |width, height| rows(width, height, STRIPS);
+        let of_views =
+            [by_default(1, 1), by_default(500, 375), by_default(1920, 1080), by_default(8000, 6000)];
+        assert_eq!(of_views, [8, 8, 63, 128]);
+        assert_eq!([rows(500, 375, 768), rows(1920, 1080, 6144)], [23, 31]);
     }
 }
