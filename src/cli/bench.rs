@@ -136,7 +136,8 @@ fn tune(bench: &Bench, sizes: &[[u32; 2]], as_json: bool) -> Result<()> {
         format!("{tile} at {channels} channels, {sorting}")
     };
     let strips = tuning.fastest.ssim_strips.map(|strips| format!("{strips} strips for SSIM"));
-    let fastest = tuning.fastest.tiles.iter().map(tile).chain(strips).collect::<Vec<_>>().join(", ");
+    let fastest =
+        tuning.fastest.tiles.iter().map(tile).chain(strips).collect::<Vec<_>>().join(", ");
     match &tuning.file {
         Some(_) => print(format_args!("fastest: {fastest}"))?,
         None => print(format_args!("fastest: {fastest}; not stored, as {TUNE_VARIABLE} is off"))?,

@@ -1,6 +1,7 @@
 //! The validated device that all tests of a process share, and injected faults.
 
 use std::cell::Cell;
+use std::num::NonZeroU32;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, OnceLock};
 

@@ -203,8 +203,9 @@ impl Gpu {
     /// What was fastest on this device and driver; nothing without measurements, or where the device is lent or opened
     /// for validation.
     fn tuning(&self) -> &Tuning {
-        let measured =
-            || self.tuning_path().map_or_else(Tuning::default, |path| load(path, self.properties()));
+        let measured = || {
+            self.tuning_path().map_or_else(Tuning::default, |path| load(path, self.properties()))
+        };
         self.shared.tuning.get_or_init(measured)
     }
 

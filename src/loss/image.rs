@@ -129,9 +129,12 @@ impl Loss {
     /// Allocates scratch memory for views up to `size`; it never shrinks.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         self.max_values = self.max_values.max(value_count(size));
-        let workgroups = self.kernels.workgroups(size) as usize;
-        self.l1_partials.grow(&self.gpu, workgroups)?;
-        self.ssim_partials.grow(&self.gpu, workgroups)?;
+        let partials = match &self.kernels {
+            ImageKernels::Ssim(ssim) => ssim.most_workgroups(size),
+            kernels @ ImageKernels::L1 { .. } => kernels.workgroups(size),
+        };
+        self.l1_partials.grow(&self.gpu, partials as usize)?;
+        self.ssim_partials.grow(&self.gpu, partials as usize)?;
         match &mut self.kernels {
             ImageKernels::Ssim(ssim) => ssim.reserve(&self.gpu, size, self.max_values),
             ImageKernels::L1 { .. } => Ok(()),

@@ -106,12 +106,34 @@ fn check_ssim(shape: [u32; 3], size: [u32; 2], loss_region: LossRegion) -> Vec<f
     .0
 }
 
+/// Crops have narrower strips than the views that memory is taken for.
+#[test]
+fn memory_for_a_view_suffices_for_every_smaller_one() {
+    on_both_plans(|gpu| {
+        let largest = UVec2::new(72, 100);
+        let mut loss = loss(gpu, 0.2).unwrap();
+        loss.reserve(largest).unwrap();
+        for size in [[72, 100], [71, 100], [61, 99], [37, 27], [1, 100], [72, 9]].map(UVec2::from) {
+            let image = || gpu.zeros("image", 3 * size.element_product() as usize).unwrap();
+            let ([render, target], mut d_render) = ([image(), image()], image());
+            let logged = log_step(gpu, |pass, log| {
+                let loss_region = LossRegion::whole(size);
+                let inputs = LossInputs { size, loss_region, render: &render, target: &target };
+                loss.record(pass, inputs, &mut d_render, log)
+            });
+            let ssim = logged.unwrap().losses.get(Term::SSIM);
+            assert!((ssim - 1.0).abs() < 1e-6, "{size}: {ssim}");
+        }
+    });
+}
+
 /// The strips of a view are a matter of speed.
 #[test]
 fn no_bit_of_the_gradient_depends_on_the_number_of_strips() {
     let gpu = gpu_with(|properties| properties.is_cpu = false);
     let size = UVec2::new(61, 333);
-    let [render, target] = images(size.to_array()).map(|image| gpu.buffer("image", &image).unwrap());
+    let [render, target] =
+        images(size.to_array()).map(|image| gpu.buffer("image", &image).unwrap());
     let evaluate = |strips: u32| {
         let mut loss = loss(&gpu, 0.2).unwrap();
         loss.set_ssim_strips(strips.try_into().unwrap());

@@ -166,6 +166,19 @@ impl SsimLoss {
         }
     }
 
+    /// At least as many as any view up to `size` has: a smaller one may have narrower or shorter strips.
+    pub(super) fn most_workgroups(&self, size: UVec2) -> u32 {
+        3 * match &self.kernels {
+            SsimKernels::One(_) => {
+                let of_layouts = LAYOUTS.map(|layout| layout.subgroups(size, self.lanes));
+                of_layouts.into_iter().fold(0, u32::max)
+            }
+            SsimKernels::Two { .. } => {
+                size.x.div_ceil(self.lanes) * size.y.div_ceil(ROWS[0] as u32)
+            }
+        }
+    }
+
     /// Returns whether both terms are in the log already.
     pub(super) fn record(
         &mut self,
@@ -276,11 +289,31 @@ mod tests {
     }
 
     #[test]
+    fn no_smaller_view_has_more_strips_than_the_most() {
+        for is_cpu in [true, false] {
+            let gpu = gpu_with(|properties| properties.is_cpu = is_cpu);
+            let loss = SsimLoss::new(&gpu, 0.2, false).unwrap();
+            for size in [UVec2::new(72, 40), UVec2::new(500, 375), UVec2::new(4000, 3000)] {
+                let most = loss.most_workgroups(size);
+                let sides = (0..100).map(|i| (size * (100 - i) / 100).max(UVec2::ONE) - i % 2);
+                let smaller = sides.flat_map(|side| [side, UVec2::new(size.x, side.y)]);
+                for view in smaller.filter(|view| view.min_element() > 0) {
+                    assert!(loss.workgroups(view) <= most, "CPU {is_cpu}: {view} in {size}");
+                }
+            }
+        }
+    }
+
+    #[test]
     fn a_larger_view_has_longer_strips_on_a_gpu() {
         let rows = |width, height, strips| rows(UVec2::new(width, height), 32, strips);
         let by_default = |width, height| rows(width, height, STRIPS);
-        let of_views =
-            [by_default(1, 1), by_default(500, 375), by_default(1920, 1080), by_default(8000, 6000)];
+        let of_views = [
+            by_default(1, 1),
+            by_default(500, 375),
+            by_default(1920, 1080),
+            by_default(8000, 6000),
+        ];
         assert_eq!(of_views, [8, 8, 63, 128]);
         assert_eq!([rows(500, 375, 768), rows(1920, 1080, 6144)], [23, 31]);
     }
