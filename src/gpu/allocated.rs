@@ -253,7 +253,7 @@ impl DeviceMemory {
         }
     }
 
-    /// Its bytes, for the host to write before a submission uses them, where that needs no more.
+    /// Its bytes, for the host to write before a submission uses them; `None` where that needs a flush or a copy.
     pub(super) fn coherent_mut(&mut self) -> Option<&mut [u8]> {
         match self.allocation.as_mut()? {
             Allocation::Ours(piece)

@@ -386,7 +386,7 @@ mod tests {
         let read = |text: &str| parsed(text.as_bytes(), &properties());
         let whole = text("Abacus 3000", "beads 1.0", [16, 4]);
         assert_eq!(read(&whole).unwrap(), tuning([16, 4]));
-        let older = whole.replace(r#""ssim_strips":1536,"#, "");
+        let older = whole.replace(r#","ssim_strips":1536"#, "");
         assert_eq!(read(&older).unwrap(), Tuning { ssim_strips: None, ..tuning([16, 4]) });
         let refused = |text: &str, part: &str| {
             let problem = read(text).unwrap_err();

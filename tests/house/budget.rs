@@ -58,7 +58,11 @@ const BUDGET: &[(&str, usize, &str)] = &[
         2270,
         "Synthetic sets, with nights, faults of cameras and normal maps; varied sets; and their tests.",
     ),
-    ("src/bench", 1261, "What `bench` measures; the tuner's tiles, sorts, segments, sums and strips."),
+    (
+        "src/bench",
+        1261,
+        "What `bench` measures; the tuner's tiles, sorts, segments, sums and strips.",
+    ),
     ("src/blocks", 960, "Plans, drafts and joins of scenes that outgrow a device."),
     (
         "src/cli",
@@ -71,7 +75,11 @@ const BUDGET: &[(&str, usize, &str)] = &[
         "Vulkan: devices, buffers, passes, checks, tiles; what hosts of any version lend; buffers filled by the host.",
     ),
     ("src/live", 940, "The live page of a run, from which the model is downloaded."),
-    ("src/loss", 2105, "The terms of the loss, of normals too, kernels ahead, strips of SSIM as tuned."),
+    (
+        "src/loss",
+        2105,
+        "The terms of the loss, of normals too, kernels ahead, strips of SSIM as tuned.",
+    ),
     ("src/networks", 2923, "Denoiser, on maps in 16 bits too, tonemapper, structure and LPIPS."),
     (
         "src/reference",

@@ -313,7 +313,7 @@ fn load_group(group: LensGroup, loading: &Loading<'_>) -> Result<Vec<LoadedView>
     let mut loaded = vec![];
     while !group.is_empty() {
         let now: Vec<_> = group.drain(..group.len().min(loading.at_once)).collect();
-        // Each takes long: none waits in turn while a thread has nothing to do.
+        // Each takes long, so threads take them one by one: none of them is idle before the end.
         let now = now.into_par_iter().with_max_len(1).map(|source| {
             loading.stage.next()?;
             views.load(source)
