@@ -6,7 +6,8 @@ pub mod scene;
 mod stages;
 mod steady;
 mod strips;
-pub(crate) mod tiles;
+mod tiles;
+pub(crate) mod tuning;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -207,6 +208,16 @@ impl Bench {
 fn median(mut times: Vec<f64>) -> f64 {
     times.sort_by(f64::total_cmp);
     times[times.len() / 2]
+}
+
+/// The choice with the least sum over cases of its time relative to the fastest of the case; `None` without a case. A
+/// case has the time of each choice, infinite for one that is not to be taken.
+fn fastest(cases: &[Vec<f64>]) -> Option<usize> {
+    let cost = |choice: usize| {
+        let least = |times: &Vec<f64>| times.iter().copied().fold(f64::INFINITY, f64::min);
+        cases.iter().map(|times| times[choice] / least(times)).sum::<f64>()
+    };
+    (0..cases.first()?.len()).min_by(|&a, &b| cost(a).total_cmp(&cost(b)))
 }
 
 /// Milliseconds of all passes together.

@@ -7,7 +7,7 @@ use nightsplat_core::random::Stream;
 use nightsplat_core::table::aligned;
 use serde_json::{Value, json};
 
-use super::{Bench, median, total};
+use super::{Bench, fastest, median, total};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::kernels::status::STATUS_WORDS;
@@ -25,23 +25,16 @@ pub(super) struct StripTimings {
 impl StripTimings {
     pub(super) fn measure(bench: &Bench, size: [u32; 2]) -> Result<Self> {
         let mut step = LossStep::new(&bench.gpu, size.into())?;
-        let mut losses = vec![];
-        for strips in STRIPS.into_iter().filter_map(NonZeroU32::new) {
-            let terms = [Term::L1, Term::SSIM];
-            let mut loss = Loss::new(&bench.gpu, 0.2, terms, Gradient::Written)?;
-            loss.set_ssim_strips(strips);
-            loss.reserve(step.size)?;
-            losses.push((loss, vec![]));
-        }
+        let mut times = STRIPS.map(|_| vec![]);
         // Interleaved, so that other load affects all alike; the first round is a warm-up.
         for round in 0..=bench.repeats {
-            for (loss, rounds) in &mut losses {
-                let milliseconds = step.profile(&bench.gpu, loss)?;
-                rounds.extend((round > 0).then_some(milliseconds));
+            for (strips, times) in STRIPS.into_iter().filter_map(NonZeroU32::new).zip(&mut times) {
+                step.loss.set_ssim_strips(strips);
+                let milliseconds = step.profile(&bench.gpu)?;
+                times.extend((round > 0).then_some(milliseconds));
             }
         }
-        let mut medians = losses.into_iter().map(|(_, rounds)| median(rounds));
-        let milliseconds = STRIPS.map(|_| medians.next().unwrap_or_default());
+        let milliseconds = times.map(median);
         Ok(Self { size, milliseconds })
     }
 
@@ -61,21 +54,15 @@ impl StripTimings {
     }
 }
 
-/// The number with the least sum over sizes of its time relative to the fastest at that size.
+/// The number that is good at every size; `None` without a size.
 pub(super) fn fastest_of(timings: &[StripTimings]) -> Option<NonZeroU32> {
-    let cost = |at: usize| {
-        let relative = |timed: &StripTimings| {
-            let least = timed.milliseconds.into_iter().fold(f64::INFINITY, f64::min);
-            timed.milliseconds[at] / least
-        };
-        timings.iter().map(relative).sum::<f64>()
-    };
-    let fastest = (0..STRIPS.len()).min_by(|&a, &b| cost(a).total_cmp(&cost(b)));
-    fastest.filter(|_| !timings.is_empty()).and_then(|at| NonZeroU32::new(STRIPS[at]))
+    let times: Vec<Vec<f64>> = timings.iter().map(|timed| timed.milliseconds.to_vec()).collect();
+    fastest(&times).and_then(|at| NonZeroU32::new(STRIPS[at]))
 }
 
-/// What a step of the loss reads and writes.
+/// The loss with what a step of it reads and writes.
 struct LossStep {
+    loss: Loss,
     size: UVec2,
     images: [Buffer<f32>; 2],
     d_render: Buffer<f32>,
@@ -91,7 +78,10 @@ impl LossStep {
             let values: Vec<f32> = (0..values).map(|i| stream.uniform(i) as f32).collect();
             gpu.buffer("noise", &values)
         };
+        let mut loss = Loss::new(gpu, 0.2, [Term::L1, Term::SSIM], Gradient::Written)?;
+        loss.reserve(size)?;
         Ok(Self {
+            loss,
             size,
             images: [noise(1)?, noise(2)?],
             d_render: gpu.uninit("d_render", values as usize)?,
@@ -101,8 +91,8 @@ impl LossStep {
     }
 
     /// Milliseconds of the loss.
-    fn profile(&mut self, gpu: &Gpu, loss: &mut Loss) -> Result<f64> {
-        let Self { size, images: [render, target], d_render, log, status } = self;
+    fn profile(&mut self, gpu: &Gpu) -> Result<f64> {
+        let Self { loss, size, images: [render, target], d_render, log, status } = self;
         let (size, loss_region) = (*size, LossRegion::whole(*size));
         let times = gpu.profile("strips", |pass| {
             let inputs = LossInputs { size, loss_region, render, target };

@@ -1,6 +1,4 @@
-//! Times the rasteriser with every tile size that the device supports, and SSIM in strips; stores what is fastest.
-
-use std::path::PathBuf;
+//! Times the rasteriser with every tile size that the device supports.
 
 use nightsplat_core::camera::Camera;
 use nightsplat_core::table::aligned;
@@ -9,11 +7,10 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use super::scene::BenchScene;
-use super::strips::{self, StripTimings};
-use super::{Bench, median, stages, total};
+use super::{Bench, fastest, median, stages, total};
 use crate::Result;
 use crate::gpu::{
-    BackwardForm, Buffer, Properties, RecordSums, Resources, Sorting, Tile, TunedTile, Tuning,
+    BackwardForm, Buffer, Properties, RecordSums, Resources, Sorting, Tile, TunedTile,
 };
 use crate::splats::batches::GradientKind;
 use crate::splats::device::{DeviceGaussians, Layout, Upload};
@@ -43,7 +40,7 @@ const LARGEST_DIFFERENCE: f32 = 0.01;
 const MEAN_DIFFERENCE: f64 = 1e-5;
 
 /// All tiles at one image size and number of channels.
-struct Case {
+pub(super) struct Case {
     channels: usize,
     size: [u32; 2],
     gaussians: usize,
@@ -63,80 +60,31 @@ struct TileTiming {
     resources: Option<[Resources; 2]>,
 }
 
-/// Every tile at every size and number of channels, strips at every size, and the fastest.
-pub(crate) struct TuningTimings {
-    cases: Vec<Case>,
-    /// Those of a GPU.
-    strips: Vec<StripTimings>,
-    /// The fastest of both.
-    pub(crate) fastest: Tuning,
-    /// The file that has them; `None` where tuning is off.
-    pub(crate) file: Option<PathBuf>,
-}
-
-impl TuningTimings {
-    /// Measures every case, and stores what is fastest.
-    pub(crate) fn measure(bench: &Bench, sizes: &[[u32; 2]]) -> Result<Self> {
-        let device = bench.gpu.properties();
-        let (mut cases, mut tiles) = (vec![], vec![]);
-        for features in FEATURES {
-            let measured = |choices: &[(Tile, Sorting)]| {
-                let sizes = sizes.iter().filter(|_| !choices.is_empty());
-                let scenes = sizes.map(|&size| bench.source.scene(size, features));
-                scenes
-                    .map(|scene| Case::measure(bench, &scene, choices))
-                    .collect::<Result<Vec<_>>>()
-            };
-            let of_tiles = measured(&choices(device))?;
-            let Some(choice) = fastest_of(&of_tiles) else { continue };
-            let of_forms = measured(&in_forms(device, choice))?;
-            let (tile, sorting) = fastest_of(&of_forms).unwrap_or(choice);
-            tiles.push(TunedTile { channels: features.channels(), tile, sorting });
-            cases.extend(of_tiles.into_iter().chain(of_forms));
-        }
-        // A processor has another kernel.
-        let of_strips = sizes.iter().filter(|_| !device.is_cpu);
-        let strips = of_strips.map(|&size| StripTimings::measure(bench, size));
-        let strips = strips.collect::<Result<Vec<_>>>()?;
-        let fastest = Tuning { tiles, ssim_strips: strips::fastest_of(&strips) };
-        let file = bench.gpu.keep_tuning(&fastest)?;
-        Ok(Self { cases, strips, fastest, file })
-    }
-
-    pub(crate) fn as_json(&self, bench: &Bench) -> Value {
-        let properties = bench.gpu.properties();
-        json!({
-            "device": properties.name,
-            "driver": properties.driver,
-            "subgroup_size": properties.subgroup_size,
-            "scene": bench.source.name(),
-            "repeats": bench.repeats,
-            "cases": self.cases.iter().map(Case::as_json).collect::<Vec<_>>(),
-            "ssim": self.strips.iter().map(StripTimings::as_json).collect::<Vec<_>>(),
-            "tiles": self.fastest.tiles,
-            "ssim_strips": self.fastest.ssim_strips,
-            "file": self.file,
-        })
-    }
-
-    /// A table for each case, and for the strips of each size.
-    pub(crate) fn tables(&self) -> impl Iterator<Item = String> {
-        self.cases.iter().map(Case::as_text).chain(self.strips.iter().map(StripTimings::as_text))
-    }
-}
-
-/// The tile and the sort with the least sum over sizes of their time relative to the fastest at that size. A tile whose
-/// kernels spill is taken only where all do: the timed scene leaves caches to spills that a larger one does not.
-fn fastest_of(cases: &[Case]) -> Option<(Tile, Sorting)> {
-    let choices = cases.first()?.tiles.iter().map(TileTiming::choice);
-    let cost = |choice: (Tile, Sorting)| {
-        let relative = |case: &Case| {
-            let timing = case.candidates().find(|measured| measured.choice() == choice);
-            timing.map_or(f64::INFINITY, |timing| timing.rasteriser() / case.least())
+/// Measures every case, and finds the fastest tile for each number of channels.
+pub(super) fn measure(bench: &Bench, sizes: &[[u32; 2]]) -> Result<(Vec<Case>, Vec<TunedTile>)> {
+    let device = bench.gpu.properties();
+    let (mut cases, mut tiles) = (vec![], vec![]);
+    for features in FEATURES {
+        let measured = |choices: &[(Tile, Sorting)]| {
+            let sizes = sizes.iter().filter(|_| !choices.is_empty());
+            let scenes = sizes.map(|&size| bench.source.scene(size, features));
+            scenes.map(|scene| Case::measure(bench, &scene, choices)).collect::<Result<Vec<_>>>()
         };
-        cases.iter().map(relative).sum::<f64>()
-    };
-    choices.min_by(|&a, &b| cost(a).total_cmp(&cost(b)))
+        let of_tiles = measured(&choices(device))?;
+        let Some(choice) = fastest_of(&of_tiles) else { continue };
+        let of_forms = measured(&in_forms(device, choice))?;
+        let (tile, sorting) = fastest_of(&of_forms).unwrap_or(choice);
+        tiles.push(TunedTile { channels: features.channels(), tile, sorting });
+        cases.extend(of_tiles.into_iter().chain(of_forms));
+    }
+    Ok((cases, tiles))
+}
+
+/// The tile and the sort that are good at every size. A tile whose kernels spill is taken only where all do: the timed
+/// scene leaves caches to spills that a larger one does not.
+fn fastest_of(cases: &[Case]) -> Option<(Tile, Sorting)> {
+    let times: Vec<Vec<f64>> = cases.iter().map(Case::times).collect();
+    fastest(&times).map(|at| cases[0].tiles[at].choice())
 }
 
 /// Every tile with every sort that a device tries.
@@ -213,19 +161,23 @@ impl Case {
         Ok(Self { channels, size, gaussians, tiles })
     }
 
-    /// The tiles to choose from: those that render what the others do, without the ones that spill unless all do.
-    fn candidates(&self) -> impl Iterator<Item = &TileTiming> {
-        let agree = || self.tiles.iter().filter(|measured| measured.agrees());
-        let all_spill = agree().all(TileTiming::spills);
-        agree().filter(move |measured| all_spill || !measured.spills())
+    /// The time of each tile, infinite for those that are not to be taken: those that do not render what the others do,
+    /// and those that spill unless all do.
+    fn times(&self) -> Vec<f64> {
+        let mut agreeing = self.tiles.iter().filter(|measured| measured.agrees());
+        let all_spill = agreeing.all(TileTiming::spills);
+        let is_taken =
+            |measured: &TileTiming| measured.agrees() && (all_spill || !measured.spills());
+        let time = |tile| if is_taken(tile) { tile.rasteriser() } else { f64::INFINITY };
+        self.tiles.iter().map(time).collect()
     }
 
     /// The time of the fastest tile.
     fn least(&self) -> f64 {
-        self.candidates().map(TileTiming::rasteriser).fold(f64::INFINITY, f64::min)
+        self.times().into_iter().fold(f64::INFINITY, f64::min)
     }
 
-    fn as_json(&self) -> Value {
+    pub(super) fn as_json(&self) -> Value {
         json!({
             "channels": self.channels,
             "width": self.size[0],
@@ -235,7 +187,7 @@ impl Case {
         })
     }
 
-    fn as_text(&self) -> String {
+    pub(super) fn as_text(&self) -> String {
         let Self { channels, size: [width, height], gaussians, .. } = self;
         let head =
             ["tile", "sorted", "blend forward", "backward", "rasteriser, ms", "intersections", ""];

@@ -8,7 +8,7 @@ use nightsplat_models::gaussians::Features;
 
 use super::{finish, print};
 use crate::Error;
-use crate::bench::tiles::TuningTimings;
+use crate::bench::tuning::TuningTimings;
 use crate::bench::{Bench, BenchOptions, Findings, Source};
 use crate::driver;
 use crate::gpu::{DeviceChoice, TUNE_VARIABLE, TunedTile};

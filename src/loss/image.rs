@@ -129,12 +129,9 @@ impl Loss {
     /// Allocates scratch memory for views up to `size`; it never shrinks.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         self.max_values = self.max_values.max(value_count(size));
-        let partials = match &self.kernels {
-            ImageKernels::Ssim(ssim) => ssim.most_workgroups(size),
-            kernels @ ImageKernels::L1 { .. } => kernels.workgroups(size),
-        };
-        self.l1_partials.grow(&self.gpu, partials as usize)?;
-        self.ssim_partials.grow(&self.gpu, partials as usize)?;
+        let workgroups = self.kernels.most_workgroups(size) as usize;
+        self.l1_partials.grow(&self.gpu, workgroups)?;
+        self.ssim_partials.grow(&self.gpu, workgroups)?;
         match &mut self.kernels {
             ImageKernels::Ssim(ssim) => ssim.reserve(&self.gpu, size, self.max_values),
             ImageKernels::L1 { .. } => Ok(()),
@@ -225,6 +222,14 @@ impl ImageKernels {
                 value_count(size).div_ceil(*values_per_workgroup)
             }
             Self::Ssim(ssim) => ssim.workgroups(size),
+        }
+    }
+
+    /// At least as many as any view up to `size` has.
+    fn most_workgroups(&self, size: UVec2) -> u32 {
+        match self {
+            Self::L1 { .. } => self.workgroups(size),
+            Self::Ssim(ssim) => ssim.most_workgroups(size),
         }
     }
 }

@@ -6,7 +6,7 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::norm_backward as planes;
 use crate::kernels::norm_backward_half::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// dL/dz .
+/// dL/dz, packed.
 fn d_source(params: &Params, constants: &Constants, slices: &Slices<'_>) -> PackedOutput {
     let bound = bound(params, slices);
     let &Params { size, channel_count, offset, slot, .. } = params;

@@ -6,7 +6,7 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::norm_forward as planes;
 use crate::kernels::norm_forward_half::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// f' .
+/// f', packed.
 fn target(params: &Params, constants: &Constants, slices: &Slices<'_>) -> PackedOutput {
     let bound = bound(params, slices);
     let &Params { size, channel_count, offset, slot, .. } = params;

@@ -111,7 +111,7 @@ fn first_shape(config: &TrainConfig) -> Shape {
     Shape { sh_degree: first_sh_degree(config), ..config.render_settings().shape }
 }
 
-/// Those of coefficients and moments.
+/// The storage formats of SH coefficients and of moments.
 fn formats(config: &TrainConfig) -> [StorageFormat; 2] {
     [config.precision.rest, config.precision.moments]
 }

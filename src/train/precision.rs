@@ -140,7 +140,7 @@ fn palette(values: &[f32], bits: PhotographBits) -> Option<Vec<u32>> {
 
 /// The bits of all different values, ascending; `None` if there are more than `most`.
 fn different(values: &[f32], most: usize) -> Option<Vec<u32>> {
-    if exceed(most, values) {
+    if hashes_exceed(most, values) {
         return None;
     }
     let capacity = values.len().min(most + 1);
@@ -162,15 +162,15 @@ fn changes(values: &[f32]) -> impl Iterator<Item = u32> {
 }
 
 /// Whether more than `most` hashes differ, and so more than `most` values, which would take longer to collect.
-fn exceed(most: usize, values: &[f32]) -> bool {
+fn hashes_exceed(most: usize, values: &[f32]) -> bool {
     const HASH_BITS: u32 = 20;
     /// 2^32 over the golden ratio.
     const SPREADING: u32 = 0x9e37_79b9;
-    let mut seen = vec![0_u64; 1 << HASH_BITS >> 6];
+    let mut seen = vec![0_u64; (1 << HASH_BITS) / 64];
     let mut different = 0;
     changes(values).any(|bits| {
         let hash = bits.wrapping_mul(SPREADING) >> (u32::BITS - HASH_BITS);
-        let (word, bit) = (&mut seen[hash as usize >> 6], 1 << (hash & 63));
+        let (word, bit) = (&mut seen[hash as usize / 64], 1 << (hash % 64));
         different += usize::from(*word & bit == 0);
         *word |= bit;
         different > most
